@@ -19,14 +19,8 @@ class Simulator(Table):
     """
     The World 'mujoco_table'.
 
-    :param task: name of a task, see tasks.task_names.
-    :param image_size: pixels of the square picture.
-    :param look: name of a look, see looks.LOOKS.
-    :param appearance: name of an appearance, see looks.CHOICES.
-    :param arm: name of an arm, see robots.arm.get_arm.
-    :raises ConfigError: for an unknown arm.
-    :raises SceneError: for an unknown task, look or appearance, a bad size, or when nothing can be
-        rendered.
+    :param task: name of a task, see tasks.task_names; the others: see Table.
+    :raises SceneError: for an unknown task, and as Table.
     """
 
     def __init__(self, task: str = 'push2', image_size: int = 64, look: str = DEFAULT_LOOK,

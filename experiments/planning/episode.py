@@ -7,7 +7,7 @@ The loop is that of visual_mpc_node, planning/reach.py, with the same seeds, so 
 same.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from experiments.planning.following import Follower
 import numpy as np
@@ -78,8 +78,8 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     start = seen = simulator.reset(seed)
     goal = simulator.goal()
-    view = FilledView(getattr(mpc.model, 'robot_mask', 'none'))
-    asked = FilledView(shown_mask(predictor) if method.predicted else 'none')
+    view = FreeView(getattr(mpc.model, 'robot_mask', 'none'))
+    asked = FreeView(shown_mask(predictor) if method.predicted else 'none')
     subgoals, refused, aborted = [], '', ''
     reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, rounds=method.rounds),
                   seed)
@@ -94,15 +94,17 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
             refused = str(error)
     while method.base != 'nothing' and not refused:
         tracked.append(seen.object_pixels)
-        shown, start_picture = view.see(seen), asked.see(seen).image
-        answer = reach.step(as_seen(shown, states))
+        shown, start_picture = (each.update(seen.image, seen.robot_mask) for each in (view, asked))
+        looked = Seen(shown, seen.gripper, tuple(seen.object_names), seen.object_pixels,
+                      seen.stamp_ns, states=states)
+        answer = reach.step(looked)
         while isinstance(answer, Aim):
-            pictures = start_picture, asked.fill(goal).image, shown.image
+            pictures = start_picture, asked.fill(goal.image, goal.robot_mask), shown
             targets, found = make_targets(
                 simulator, mpc, method, seen, goal, predictor, seed, pictures)
             subgoals += found
             reach.head_for(targets)
-            answer = reach.step(as_seen(shown, states))
+            answer = reach.step(looked)
         if isinstance(answer, End):
             aborted = answer.message if answer.outcome == 'aborted' else ''
             break
@@ -119,36 +121,6 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
         true_goal, reach.targets or [Target(goal.object_pixels)], reach.switches,
         np.array(tracked or [start.object_pixels]), subgoals,
         follower.placed if follower else [], refused, aborted)
-
-
-class FilledView:
-    """
-    Observations of one episode without the robot, as the nodes show them to networks.
-
-    :param robot_mask: see robot_mask.hidden_pixels.
-    """
-
-    def __init__(self, robot_mask):
-        self._robot_mask, self._view = robot_mask, FreeView(robot_mask)
-
-    def see(self, observation):
-        """Fill an Observation of the camera, the newest one, and remember what it shows."""
-        return self._filled(observation, self._view.update)
-
-    def fill(self, observation):
-        """Fill an Observation of the same scene, such as the goal."""
-        return self._filled(observation, self._view.fill)
-
-    def _filled(self, observation, fill):
-        if self._robot_mask == 'none':
-            return observation
-        return replace(observation, image=fill(observation.image, observation.robot_mask))
-
-
-def as_seen(observation, states=()):
-    """Return an Observation of the simulator as reach.Seen, with the states of its objects."""
-    return Seen(observation.image, observation.gripper, tuple(observation.object_names),
-                observation.object_pixels, observation.stamp_ns, states=states)
 
 
 def shown_mask(predictor):

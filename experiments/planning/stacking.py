@@ -9,13 +9,14 @@ true physics. A picture says which object goes where.
 
 from dataclasses import dataclass, field
 
-from experiments.planning.episode import FilledView, shown_mask
+from experiments.planning.episode import shown_mask
 from experiments.planning.reading import Move, PictureReader, read_moves
 import numpy as np
 from sim_bridge.tasks.stack import on_table, PickAndPlace
 from sim_bridge.tasks.tasks import run_episode as run_expert
 from tap_ros.contract import LIFTED, SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError
+from tap_ros.training.robot_mask import FreeView
 
 OVER = 0.045  # m; an object whose place is nearer to another one, from above, is put on that
 ARRIVED = 0.01  # m from its last place, then an object of the expert's is where it goes
@@ -136,7 +137,8 @@ def _expert_subgoals(simulator, seed):
 
 def _predict(predictor, method, start, goal, seed):
     """Return the pictures of the predicted subgoals, the earliest first."""
-    view = FilledView(shown_mask(predictor))
-    subgoals = predictor.predict(view.see(start).image, view.fill(goal).image,
-                                 recursion_depth=method.recursion, seed=seed)
+    view = FreeView(shown_mask(predictor))
+    pictures = [fill(seen.image, seen.robot_mask)
+                for fill, seen in ((view.update, start), (view.fill, goal))]
+    subgoals = predictor.predict(*pictures, recursion_depth=method.recursion, seed=seed)
     return [subgoal.image for subgoal in subgoals]

@@ -41,12 +41,6 @@ def predictor():
     return SubgoalPredictor.load(DEFAULT_PREDICTOR)
 
 
-def test_doing_nothing_ends_20_cm_away(simulator, mpc):
-    run = run_episode(simulator, mpc, parse_method('nothing'), 10, seed=5)
-    np.testing.assert_allclose(run.distances, 0.2, atol=1e-3)
-    assert len(run.frames) == 1 and not len(run.actions)
-
-
 def test_the_goal_follows_the_subgoal_at_half_the_budget(simulator, mpc, predictor):
     run = run_episode(simulator, mpc, SHIPPED, 4, 5, predictor)
     assert run.switches == [2] and len(run.actions) == 4

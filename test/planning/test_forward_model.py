@@ -71,17 +71,6 @@ def test_gripper_moves_by_the_action_within_limits_and_workspace(model):
     torch.testing.assert_close(moved, torch.tensor([[0.45, 0.08, 0.0, 1.0]]))
 
 
-def test_objects_lose_themselves_only_with_nearly_all_of_their_mass(model):
-    maps = model.table.seed_maps(PIXELS)[None]
-    flow = model.still(1).clone()
-    torch.testing.assert_close(model.carry(maps, flow), maps)
-    flow[:, 0] = 4.0  # from beyond the table
-    assert not model.carry(maps, flow).any()
-    weak = 0.06 * maps
-    torch.testing.assert_close(model.carry(weak, model.still(1)), maps)
-    assert not model.carry(0.04 * maps, model.still(1)).any()
-
-
 def test_the_arm_is_drawn_where_its_camera_says_and_nowhere_else(model):
     size = model.config.sprite_size
     grippers = torch.tensor([[0.1, 0.2, 0.0, 0.0], [-0.2, -0.1, 0.1, 1.0]])

@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.planning.forward_loss import forward_loss, make_windows
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
-from tap_ros.planning.forward_training import draw_step, model_config, train
+from tap_ros.planning.forward_training import model_config, train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.planning.table import project
 from tap_ros.recording.cache import open_recordings
@@ -96,23 +96,6 @@ class Store(list):
     @property
     def lengths(self):
         return [len(episode.frames) for episode in self]
-
-
-def test_a_step_draws_what_its_seed_and_number_say_and_windows_grow():
-    store = Store(make_episode(number) for number in range(3))
-    config = ForwardTrainingConfig(recordings=('x',), out='x', steps=100, grow=0.5, horizon=8,
-                                   batch_size=3, pictures=4)
-
-    def draw(step, **changes):
-        return draw_step(replace(config, **changes), store, np.arange(3), step, HOMOGRAPHY)
-
-    lengths = [draw(step)[0].actions.shape[1] for step in range(0, 100, 7)]
-    assert lengths == sorted(lengths) and lengths[0] == 2 and set(lengths[8:]) == {8}
-    assert draw(24)[0].actions.shape[1] == 5 and draw(48)[0].actions.shape[1] == 8
-    batch, shown = draw(60)
-    same, same_shown = draw(60)
-    assert torch.equal(batch.images, same.images) and shown == same_shown
-    assert not torch.equal(batch.images, draw(61)[0].images)
 
 
 def config_for(bag, out, **changes):

@@ -8,7 +8,6 @@ import pytest
 from tap_ros.prediction.losses import (
     bell,
     bell_preference,
-    beside_context,
     l1_error,
     l1_errors,
     linear_preference,
@@ -78,17 +77,6 @@ def test_padding_is_not_on_the_way_and_no_way_at_all_is_finite():
         picture_progress(error[..., :5], valid[:, :5]))
     for error in (torch.full((2, 2, 1), 0.1), torch.zeros(2, 2, 4)):
         assert bell(picture_progress(error, every(error))).isfinite().all()
-
-
-def test_what_shows_too_little_or_too_much_of_the_way_is_beside_the_context():
-    progress = torch.tensor([[-1, -0.6, -0.4, 0, 0.5, 0.51, 1], [-1, -1, -1, -1, 0.9, 1, 1]])
-    valid = torch.ones(2, 7, dtype=torch.bool)
-    assert beside_context(progress, 0.5, valid).tolist() == [
-        [True, True, False, False, False, True, True],
-        [True, True, True, True, False, True, True]]  # one is left, the nearest to the middle
-    valid[1, 4] = False
-    assert not beside_context(progress, 0.5, valid)[1, :4].all()
-    assert not beside_context(progress, 0, valid).any()
 
 
 def test_copying_is_worth_1_everywhere_also_where_hardly_anything_changed():

@@ -12,18 +12,14 @@ from made_episodes import make_episode, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
-from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.mark_command import Marking, Server
 from tap_ros.prediction.marks import learn_marks
-from tap_ros.prediction.networks import Prediction
-from tap_ros.prediction.objective import Networks, predictor_loss
-from tap_ros.prediction.preference import FLOOR, Preference
+from tap_ros.prediction.preference import Preference
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks, write_marks
 from tap_ros.training.weights import load_weights
-import torch
 
 
 @pytest.fixture
@@ -81,37 +77,6 @@ def test_marks_of_something_else_are_refused_with_the_file_and_the_reason(bag, s
         assert said in refusal(data), data
     entry = {'recording': str(bag), 'episode': 0, 'stamps': [begin + 0.5]}
     assert 'marked above' in refusal(json.dumps({'marks': [entry, entry]}))
-
-
-class Showing(torch.nn.Module):
-    """Predicts one picture, whatever it is given."""
-
-    def __init__(self, image):
-        super().__init__()
-        self.image = image
-
-    def forward(self, context, z=None):
-        return Prediction(self.image, None, None, None)
-
-
-def test_the_learned_preference_is_of_the_frame_whatever_piece_is_shown(store):
-    config = TrainingConfig(('x',), 'x', selection='marks', marks='x', recursion=2)
-    preference = []
-    for n in store.lengths:
-        w = np.full((2, n), FLOOR, np.float32)
-        w[0, n - 3] = w[1, n - 5] = 1  # the later mark first
-        preference.append(w)
-    for start_crop in (0.0, 0.5):
-        batch = make_batch(store, range(8), Sampling(start_crop=start_crop), preference=preference,
-                           rng=np.random.default_rng(1))
-        for b in range(8):
-            late = store.lengths[b] - 1 - batch.end[b, 0]
-            valid = batch.valid[b]
-            assert batch.preference[b][:, valid].numpy() == pytest.approx(
-                preference[b][:, (late + batch.times[b][valid]).tolist()])
-    network = Networks(Showing(torch.zeros(8, 3, 32, 32)))
-    match = predictor_loss(network, batch, None, config).match
-    assert (batch.times.gather(1, match[:, None]) == batch.end - 2).all()
 
 
 def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_path, capsys):

@@ -46,18 +46,6 @@ def test_it_predicts_what_the_predictor_does_in_the_pixels_of_the_start_picture(
     assert picture.shape[1] > 3 * picture.shape[0] and picture.std() > 20
 
 
-def test_without_objects_pictures_alone_are_predicted_and_samples_are_rows(
-        files, tmp_path, capsys):
-    sizes = []
-    for options in (files[:1] + ['--weights', 'grasp_forward'],
-                    files + ['--weights', 'pick_place_vae', '--samples', '3']):
-        out = tmp_path / 'out.png'
-        assert main(['predict', *options, '--out', str(out)]) == 0
-        sizes.append(cv2.imread(str(out)).shape)
-    assert 'object 1' not in capsys.readouterr().out
-    assert sizes[1][0] == 3 * sizes[0][0] and 2 * sizes[1][1] == 3 * sizes[0][1]
-
-
 def refusal(capsys, *arguments):
     """Return the one line in which a prediction is refused."""
     assert main(['predict', *arguments]) == 1

@@ -61,14 +61,10 @@ def test_kl_is_that_of_torch_and_samples_have_the_posteriors_mean_and_variance()
     assert z.var(0).allclose(log_variance[0].exp(), rtol=0.05)
 
 
-def test_recognition_begins_with_the_spread_asked_for_and_never_makes_z_infinite():
+def test_recognition_begins_with_the_spread_asked_for():
     video = draw(4, 6, 3, 32, 32).tanh()
     for std in (1.0, 0.1):
         mean, log_variance = Recognition(SMALL, 6, std)(video)
         assert (log_variance / 2).exp().allclose(torch.tensor(std), rtol=0.2)
-    network = Recognition(SMALL, 6)
-    with torch.no_grad():
-        network.head[-1].bias[8:] = torch.linspace(-1e4, 1e4, 8)  # the log variances
-    assert kl_divergence(*network(video)).max() < 2000
     with pytest.raises(ConfigError, match='latent_size'):  # a predictor without z has none
         Recognition(PredictorConfig(base_width=4), 6)

@@ -13,11 +13,9 @@ from sim_bridge.gym_pushes import record_pushes
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from sim_bridge.world_protocol import make_world
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.engines import Engine
 from tap_ros.errors import SceneError, TapError
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.topic_choice import find_topics
 
 
 class Dot(GymWorld):
@@ -95,6 +93,7 @@ def metaworld():
 
 def test_meta_world_moves_as_it_is_told_and_repeats_from_its_seed(metaworld):
     first = metaworld.reset(5)
+    assert (first.robot_mask > 0).any()
     seen = [metaworld.step([0.05, -0.02, 0, 1]) for _ in range(3)][-1]
     np.testing.assert_allclose(
         seen.gripper[:3] - first.gripper[:3], [0.15, -0.06, 0], atol=0.01)
@@ -109,15 +108,6 @@ def test_meta_world_moves_as_it_is_told_and_repeats_from_its_seed(metaworld):
     assert changed[v - 2:v + 3, u - 2:u + 3].any()
 
 
-def test_the_robot_mask_of_meta_world_covers_what_moves_with_the_arm(metaworld):
-    before = metaworld.reset(5)
-    after = metaworld.step([-0.08, 0, 0.0, 1])
-    changed = np.abs(after.image.astype(int) - before.image).max(-1) > 40
-    masked = (before.robot_mask > 0) | (after.robot_mask > 0)
-    assert {ROBOT_MASK_ARM, ROBOT_MASK_HAND} <= set(np.unique(before.robot_mask))
-    assert changed.any() and (changed & ~masked).sum() <= 0.05 * changed.sum()
-
-
 def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
     pytest.importorskip('metaworld')
     folder = tmp_path / 'bag'
@@ -127,9 +117,6 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
     first, second = open_recordings(folder)
     assert (first.task, first.seed, first.outcome) == ('plate-slide-v3', 3, 'success')
     assert len({12, len(first), len(second)}) == 3, 'each goes its own way at its own speed'
-    topics = find_topics(sorted(folder.glob('*.mcap')))
-    assert set(topics) <= {'/camera/image_raw', '/camera/camera_info', '/clock', '/episode',
-                           '/arm/delta_twist_cmds', '/gripper/command'}
     assert (first.frames[0] != second.frames[0]).any(), 'each has a scene of its own'
     marks = json.loads((folder / BOTTLENECKS_FILE).read_text())['marks']
     assert [mark['episode'] for mark in marks] == [0, 1]
