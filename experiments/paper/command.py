@@ -40,7 +40,11 @@ def run(args):
     :return: exit status: 0, or 1 if a run failed.
     :raises ConfigError: if no run fits.
     """
-    runs, failed = choose_runs(args.only), {}
+    runs, failed = [run for run in paper_runs() if not args.only or any(
+        fnmatch(run.name, pattern) for pattern in args.only)], {}
+    if not runs:
+        raise ConfigError(f'--only {" ".join(args.only)}: no run has such a name; --list shows '
+                          'all')
     if args.list:
         show(runs, args.places)
         return 0
@@ -50,15 +54,6 @@ def run(args):
     write_results(args.places)
     print(f'{len(runs) - len(failed)} of {len(runs)} runs are done')
     return 1 if failed else 0
-
-
-def choose_runs(patterns):
-    """Return the runs whose names fit a pattern, without patterns all; ConfigError for none."""
-    runs = [run for run in paper_runs() if not patterns or any(
-        fnmatch(run.name, pattern) for pattern in patterns)]
-    if not runs:
-        raise ConfigError(f'--only {" ".join(patterns)}: no run has such a name; --list shows all')
-    return runs
 
 
 def show(runs, places):

@@ -68,7 +68,7 @@ def group_runs(runs):
                 copied.add((task, mode, scale, copy))
                 groups.append(_group({**key, 'method': copy}, same[:1], copy))
         for name in same[0]['evaluation'].get('shifted', ()):
-            other = shifted_task(task, name)
+            other = name if name.startswith(task) else f'{task}_{name}'
             shifted = [{**run, 'evaluation': run['evaluation']['shifted'][name]} for run in same]
             groups.append(_group({**trained, 'task': other}, shifted, 'prediction'))
             if (other, mode, scale) not in copied:
@@ -76,11 +76,6 @@ def group_runs(runs):
                 groups.append(_group({**key, 'task': other, 'method': 'copy-goal'}, shifted[:1],
                                      'copy-goal'))
     return groups
-
-
-def shifted_task(task, name):
-    """Name the recording of a shift: arm_elsewhere of push2 is push2_arm_elsewhere."""
-    return name if name.startswith(task) else f'{task}_{name}'
 
 
 def _group(key, runs, part, of=''):
@@ -121,7 +116,12 @@ def make_rows(groups):
                  values, by_seed=' '.join(f'{x:.6g}' for x in statistic(values, -1)))
             for group in groups for metric, statistic, values in _measures(group)
             if values.size]
-    return rows + _gain_rows(groups) + _equal_gain_rows(groups) + _best_rows(groups)
+    for group in groups:
+        baseline = find_baseline(group, groups)
+        if baseline is not None and not group.key['method'].startswith('fix'):
+            rows.append(_row(group, 'gain_over_fix', relative_gain, group.scores['min_l1'],
+                             baseline.scores['min_l1'], baseline=baseline.key['method']))
+    return rows + _equal_gain_rows(groups) + _best_rows(groups)
 
 
 def _measures(group):
@@ -199,24 +199,12 @@ def find_baseline(group, groups):
     return None
 
 
-def _gain_rows(groups):
-    """Compare the error of each method with that of fix."""
-    rows = []
-    for group in groups:
-        baseline = find_baseline(group, groups)
-        if baseline is None or group.key['method'].startswith('fix'):
-            continue
-        rows.append(_row(group, 'gain_over_fix', relative_gain, group.scores['min_l1'],
-                         baseline.scores['min_l1'], baseline=baseline.key['method']))
-    return rows
-
-
 def _best_rows(groups):
     """Compare the best of 100 samples with the lowest method without VAE, at equal steps."""
     rows = []
     for group in groups:
         others = [other for other in groups if '-vae' not in other.key['method']
-                  and trained_as_long(other.key['method']) and all(
+                  and variant_of(other.key['method']) not in LONG and all(
                       other.key.get(part) == group.key[part]
                       for part in ('task', 'mode', 'scale', 'new_pixels'))] if group.of else []
         if others:
@@ -311,11 +299,6 @@ def variant_of(method):
     name = re.sub(r'-r\d+$', '', method)
     return max((variant for variant in (*VARIANTS, *PAST_VARIANTS) if name.endswith(variant)),
                key=len)
-
-
-def trained_as_long(method):
-    """Return whether a method was trained for the usual number of steps."""
-    return variant_of(method) not in LONG
 
 
 def network_of(method):

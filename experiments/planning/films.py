@@ -14,12 +14,6 @@ SCALE = 2
 WHITE = (255, 255, 255)
 
 
-def pick_scenes(scenes):
-    """Return the seeds of the best, the median and the worst scene, from scenes by seed."""
-    order = sorted(scenes, key=lambda seed: (scenes[seed]['final_cm'], seed))
-    return [order[0], order[(len(order) - 1) // 2], order[-1]]
-
-
 def write_film(job, scenes, path):
     """
     Run three scenes again, and draw each as a row.
@@ -32,8 +26,8 @@ def write_film(job, scenes, path):
     :param path: .png file.
     :raises ConfigError: if a scene does not end as it did.
     """
-    rows = []
-    for seed in pick_scenes(scenes):
+    rows, order = [], sorted(scenes, key=lambda seed: (scenes[seed]['final_cm'], seed))
+    for seed in (order[0], order[(len(order) - 1) // 2], order[-1]):
         run, before = make_episode(job, seed), scenes[seed]['final_cm']
         ended = 100 * (run.distances if job.stacks else run.distances[-1]).mean()
         if abs(ended - before) > SAME_CM:

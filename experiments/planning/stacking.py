@@ -91,7 +91,10 @@ def stack(simulator, method, seed, predictor=None):
     distances = simulator.distances()
     success = simulator.outcome() == 'success' and bool((distances < SUCCESS_DISTANCE).all())
     run = StackedEpisode(start, goal, distances, success, False, stages, frames)
-    run.first_right = bool(run.moves) and _is_first(run.moves[0], simulator.scene)
+    if run.moves:
+        move, k = run.moves[0], simulator.scene.order[0]
+        gap = np.linalg.norm(simulator.scene.goal_poses[k, :2] - move.place)
+        run.first_right = bool(move.object == k and gap < SUCCESS_DISTANCE)
     return run
 
 
@@ -117,13 +120,6 @@ def what_is_below(poses, move):
     others = np.delete(poses[:, :3], move.object, axis=0)
     under = others[np.linalg.norm(others[:, :2] - place, axis=1) < OVER]
     return under[under[:, 2].argmax()] if len(under) else on_table(place)
-
-
-def _is_first(move, scene):
-    """Say whether a move brings the object that has to be first to its place."""
-    k = scene.order[0]
-    gap = np.linalg.norm(scene.goal_poses[k, :2] - move.place)
-    return bool(move.object == k and gap < SUCCESS_DISTANCE)
 
 
 def _expert_subgoals(simulator, seed):

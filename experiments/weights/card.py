@@ -50,13 +50,24 @@ def ship(name, task, run, fresh, out, commands):
     store = open_recordings([str(fresh)], progress=False)
     episodes = np.arange(len(store))
     forward = config['num_context'] == 1
-    goals = ['none' if forward else 'last frame']
+    goal = 'none' if forward else 'last frame'
+    goals = {goal: 'last'}
     if not forward and not np.array_equal(store[0].goal_frame, store[0].frames[-1]):
-        goals.append('arm elsewhere')
-    scores = {goal: evaluate(network, store, episodes, goal_picture=_option(goal))
-              for goal in goals}
-    first = scores[goals[0]]['prediction']
-    samples = sample_facts(network, store, episodes) if network.config.latent_size else None
+        goals['arm elsewhere'] = 'recorded'
+    scores = {name: evaluate(network, store, episodes, goal_picture=picture)
+              for name, picture in goals.items()}
+    first = scores[goal]['prediction']
+    known = first.intervals()
+    metrics = [(name, title, round(known[name].value, digits))
+               for title, (name, digits) in _COLUMNS.items() if name in known and name in (
+                   'min_l1', _BOTTLENECKS if _BOTTLENECKS in known else 'shows_both')]
+    samples = None
+    if network.config.latent_size:
+        drawn = score_samples(network, store, episodes)
+        placed = drawn.spread_px[np.isfinite(drawn.spread_px)]
+        samples = {'count': SAMPLES, 'placed': f'{placed.mean():.1f}' if len(placed) else '',
+                   'near': f'{np.nanmean(drawn.spread_near):.4f}',
+                   'best': '{:.4f} ({:.4f} to {:.4f})'.format(*mean_interval(drawn.min_l1))}
     good = found(first)
     shown = [*np.flatnonzero(good)[:PICTURED], *np.flatnonzero(~good)[:PICTURED]]
     write_strips(file.with_suffix('.png'), network, store, shown, 'last')
@@ -67,41 +78,10 @@ def ship(name, task, run, fresh, out, commands):
         collect=collect, again=again, train=train,
         run=json.loads((run / 'run.json').read_text()),
         fresh=len(store), pushing=np.isfinite(first.bottleneck).any(), forward=forward,
-        goal=goals[0], metrics=headline(first), samples=samples,
+        goal=goal, metrics=metrics, samples=samples,
         scores=tabulate(scores), succeed=int(good[shown].sum()),
         fail=int((~good[shown]).sum())))
     return card
-
-
-def headline(scores):
-    """
-    Choose what the card's front matter tells: (name, title, value) each, for model hubs.
-
-    :param scores: EpisodeScores of predictions.
-    """
-    known = scores.intervals()
-    titles = {name: (title, digits) for title, (name, digits) in _COLUMNS.items()}
-    names = ('min_l1', _BOTTLENECKS if _BOTTLENECKS in known else 'shows_both')
-    return [(name, titles[name][0], round(known[name].value, titles[name][1]))
-            for name in names if name in known]
-
-
-def sample_facts(network, store, episodes):
-    """
-    Measure 100 samples of each episode, goal picture the last frame.
-
-    :param network: Predictor with z.
-    :param store: the EpisodeStore.
-    :param episodes: indices of episodes.
-    :return: dict of texts for the card: their number, the best one's error with its interval, and
-        how much they differ: in px where positions are known, and in the pixels near objects.
-    """
-    samples = score_samples(network, store, episodes)
-    least = mean_interval(samples.min_l1)
-    placed = samples.spread_px[np.isfinite(samples.spread_px)]
-    return {'count': SAMPLES, 'placed': f'{placed.mean():.1f}' if len(placed) else '',
-            'near': f'{np.nanmean(samples.spread_near):.4f}',
-            'best': f'{least.value:.4f} ({least.low:.4f} to {least.high:.4f})'}
 
 
 def found(scores):
@@ -137,8 +117,3 @@ def tabulate(scores):
                 '{:.{n}f} ({:.{n}f} to {:.{n}f})'.format(*row, n=digits)
                 if np.isfinite(row).all() else None for row in known]
     return table
-
-
-def _option(goal):
-    """Return what `evaluate prediction --goal-picture` calls it."""
-    return 'recorded' if goal == 'arm elsewhere' else 'last'

@@ -173,7 +173,8 @@ def score(marked, held_out):
             found[key] = _interval([
                 [first - beside <= choose(frames) <= last + beside
                  for frames, (first, last), *_ in held_out] for choose in choices
-            ]) if choices else _random(held_out, beside)
+            ]) if choices else mean_interval([
+                chance(window, len(frames), beside) for frames, window, *_ in held_out])
         rows.append({'method': name, 'n': len(held_out), 'bottleneck_frames': length,
                      'frames': float(np.mean([len(one.frames) for one in held_out])),
                      **{key: Interval(*map(float, value))._asdict()
@@ -184,12 +185,6 @@ def score(marked, held_out):
 def _interval(hits):
     """Return the share of hits (S, N) of S seeds, with the interval over the demonstrations."""
     return share_interval(hits[0]) if len(hits) == 1 else mean_interval(np.mean(hits, axis=0))
-
-
-def _random(demonstrations, beside):
-    """Return how often any frame between start and goal hits."""
-    return mean_interval([chance(window, len(frames), beside)
-                          for frames, window, *_ in demonstrations])
 
 
 def average(rows):

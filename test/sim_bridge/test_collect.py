@@ -101,7 +101,7 @@ def test_what_was_killed_goes_on_to_the_same_files(whole, tmp_path):
     os.kill(int(worker), signal.SIGKILL)  # another takes its place
     while not list(folder.glob('*_0.mcap')) and process.poll() is None:
         time.sleep(0.02)
-    process.end()
+    process.kill()
     process.wait()
     collect(folder, SMALL, Engine(workers=1), progress=False)
     assert contents(folder) == contents(whole)
