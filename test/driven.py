@@ -68,6 +68,7 @@ class World:
     :param rate_hz: how often.
     :ivar silent: names of what is not published, of TOPICS.
     :ivar objects: (K, 2) pixels and K names published, each None for the true ones.
+    :ivar states: of the objects, published with them; [] for none.
     :ivar gripper: (4,) published, None for the true one.
     :ivar shift_s: added to all stamps; late_s: by which the joints are older than the rest.
     :ivar frozen: {topic: stamp in ns that it repeats}.
@@ -115,7 +116,7 @@ class World:
     def _reset(self):
         self.silent, self.frozen, self.clock_ns = set(), {}, None
         self.shift_s = self.late_s = 0.0
-        self.objects, self.gripper = (None, None), None
+        self.objects, self.states, self.gripper = (None, None), [], None
 
     def silence(self, *topics):
         """Publish these no longer; return when the last of them was sent."""
@@ -128,8 +129,9 @@ class World:
         gripper = self._seen.gripper if self.gripper is None else self.gripper
         image, objects, joints = (to_stamp(self.frozen.get(topic, at)) for topic, at in zip(
             TOPICS, (now_ns, now_ns, now_ns - int(1e9 * self.late_s))))
-        return {'joints': encode_joints(gripper, joints, WORLD_FRAME),
-                'objects': objects_message(self._seen, objects, *self.objects),
+        seen = objects_message(self._seen, objects, *self.objects)
+        seen.states = self.states
+        return {'joints': encode_joints(gripper, joints, WORLD_FRAME), 'objects': seen,
                 'image': encode_image(self._seen.image, image, CAMERA_FRAME)}
 
     def publish(self, messages):
@@ -158,25 +160,17 @@ class Arm:
 
     def __init__(self, node):
         self.refusing = False
-        self._kept, self._changed = [], threading.Condition()  # (time.monotonic(), whether a move)
+        self._kept = []  # (time.monotonic(), whether it is a move)
         self._refused = node.create_publisher(CommandRefused, 'arm/refused', STREAM)
         node.create_subscription(TwistStamped, 'arm/delta_twist_cmds', self._put, STREAM)
 
     def moves(self, moment):
         """Return when the commands after a moment of time.monotonic() came that are no stops."""
-        with self._changed:
-            return [at for at, move in self._kept if at > moment and move]
+        return [at for at, move in list(self._kept) if at > moment and move]
 
     def forget(self):
         """Drop all."""
-        with self._changed:
-            self._kept.clear()
-
-    def wait_for_moves(self, moment, count, timeout_s=MOVING_S):
-        """Wait until so many moves have come after a moment; tell whether they have."""
-        with self._changed:
-            return self._changed.wait_for(
-                lambda: sum(at > moment and move for at, move in self._kept) >= count, timeout_s)
+        self._kept.clear()
 
     def seconds_to_stop(self, moment):
         """
@@ -184,8 +178,7 @@ class Arm:
 
         A stop that was sent before counts as 0 s where no move came after the moment.
         """
-        with self._changed:
-            kept = list(self._kept)
+        kept = list(self._kept)
         last = max((index for index, (_, move) in enumerate(kept) if move), default=-1)
         return max(0.0, kept[last + 1][0] - moment) if kept[last + 1:] else float('inf')
 
@@ -203,9 +196,7 @@ class Arm:
     def _put(self, message):
         linear = message.twist.linear
         move = any((linear.x, linear.y, linear.z))
-        with self._changed:
-            self._kept.append((time.monotonic(), move))
-            self._changed.notify_all()
+        self._kept.append((time.monotonic(), move))
         if move and self.refusing:
             self._refused.publish(CommandRefused(
                 header=message.header, message='protective stop; release it on the pendant'))

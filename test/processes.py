@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes as processes or in this process, and a client node of the test's own, all over DDS."""
 
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import re
@@ -117,23 +118,18 @@ class NodeProcess:
         return int(pages) * os.sysconf('SC_PAGE_SIZE') / 1e6
 
 
-class Client:
-    """A node of the test's own with a thread that spins it; several may live side by side."""
-
-    def __init__(self, name='test_client', **options):
-        self.context = Context()
-        self.context.init()
-        self.node = Node(name, context=self.context, **options)
-        self.spinner = Spinner(self.node)
-
-    def __enter__(self):
-        self.spinner.__enter__()
-        return self.node
-
-    def __exit__(self, *_):
-        self.spinner.__exit__()
-        self.node.destroy_node()
-        self.context.try_shutdown()
+@contextmanager
+def Client(name='test_client', **options):
+    """Give a node of the test's own that a thread spins; several may live side by side."""
+    context = Context()
+    context.init()
+    node = Node(name, context=context, **options)
+    try:
+        with Spinner(node):
+            yield node
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
 
 
 class Newest:
@@ -141,40 +137,28 @@ class Newest:
     Keep the newest message of a topic.
 
     :param node: rclpy Node that another thread spins.
-    :param message_type: type of the topic.
-    :param topic: its name.
-    :param qos: its QoSProfile.
     :ivar count: messages received so far.
     """
 
     def __init__(self, node, message_type, topic, qos):
-        self._topic = topic
-        self._condition = threading.Condition()
-        self.count = 0
-        self._message = None
+        self._topic, self._message, self.count = topic, None, 0
         node.create_subscription(message_type, topic, self._put, qos)
 
     def wait(self, timeout_s, accept=lambda message: True):
-        """
-        Return the newest message once it is acceptable.
+        """Return the newest message once `accept` says so of it; CallError if none comes."""
+        def acceptable():
+            message = self._message
+            return message if message is not None and accept(message) else None
 
-        :param timeout_s: most seconds to wait.
-        :param accept: called with a message; whether it is the one waited for.
-        :return: the message.
-        :raises CallError: when none comes in time.
-        """
-        with self._condition:
-            if self._condition.wait_for(
-                    lambda: self._message is not None and accept(self._message), timeout_s):
-                return self._message
-        got = f'{self.count} messages, none of them as wanted' if self.count else 'no message'
-        raise CallError(f'topic {self._topic}: {got} within {timeout_s:g} s')
+        found = until(acceptable, timeout_s, 0.005)
+        if found is None:
+            raise CallError(f'topic {self._topic}: of {self.count} messages none was as wanted '
+                            f'within {timeout_s:g} s')
+        return found
 
     def _put(self, message):
-        with self._condition:
-            self._message = message
-            self.count += 1
-            self._condition.notify_all()
+        self._message = message
+        self.count += 1
 
 
 class LocalNode:

@@ -19,21 +19,8 @@ from sim_bridge.world_protocol import ability, Observation, World
 from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, OBSERVER_FRAME, WORLD_FRAME
-from tap_ros.messages.topics import (
-    CAMERA_POSE,
-    GOAL_OBJECTS,
-    OBJECTS,
-    TRUE_GOAL_OBJECTS,
-    TRUE_OBJECTS,
-)
-from tap_ros.nodes.ros_messages import (
-    encode_camera_info,
-    encode_image,
-    encode_joints,
-    encode_mask,
-    encode_objects,
-    make_message,
-)
+from tap_ros.messages import topics
+from tap_ros.nodes import ros_messages
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.robots.arm import Transform
 from tap_ros.robots.description import robot_description
@@ -57,12 +44,13 @@ class ScenePublishers:
         self._newest: dict[str, Any] = {}  # topic -> the message sent last
         streams = STREAMS | ({'observer/image_raw': Image} if observer else {})
         names = {one.name: true.name for one, true in (
-            (OBJECTS, TRUE_OBJECTS), (GOAL_OBJECTS, TRUE_GOAL_OBJECTS))} if tracked else {}
+            (topics.OBJECTS, topics.TRUE_OBJECTS),
+            (topics.GOAL_OBJECTS, topics.TRUE_GOAL_OBJECTS))} if tracked else {}
         self._publishers = {topic: node.create_publisher(kind, names.get(topic, topic), qos)
                             for kinds, qos in ((streams, STREAM), (GOAL, LATCHED))
                             for topic, kind in kinds.items()}
         self._observer = observer
-        self._pose = node.create_publisher(PoseStamped, CAMERA_POSE.name, LATCHED)
+        self._pose = node.create_publisher(PoseStamped, topics.CAMERA_POSE.name, LATCHED)
         self._description = node.create_publisher(String, 'robot_description', LATCHED)
         if world.arm is not None:
             self._description.publish(String(data=robot_description(world.arm)))
@@ -78,16 +66,16 @@ class ScenePublishers:
         arm = world.arm
         self._newest = {
             'clock': Clock(clock=stamp),
-            'joint_states': encode_joints(
+            'joint_states': ros_messages.encode_joints(
                 seen.gripper, stamp, WORLD_FRAME,
                 dict(zip(arm.joints, seen.arm_joints)) if arm is not None else None),
             'objects': _objects(seen, stamp),
-            'camera/camera_info': encode_camera_info(
+            'camera/camera_info': ros_messages.encode_camera_info(
                 world.camera_matrix, seen.image.shape[:2], stamp, CAMERA_FRAME),
-            'camera/image_raw': encode_image(seen.image, stamp, CAMERA_FRAME),
-            'camera/robot_mask': encode_mask(seen.robot_mask, stamp, CAMERA_FRAME)}
+            'camera/image_raw': ros_messages.encode_image(seen.image, stamp, CAMERA_FRAME),
+            'camera/robot_mask': ros_messages.encode_mask(seen.robot_mask, stamp, CAMERA_FRAME)}
         if self._observer:
-            self._newest['observer/image_raw'] = encode_image(
+            self._newest['observer/image_raw'] = ros_messages.encode_image(
                 ability(world, 'observer_picture')(), stamp, OBSERVER_FRAME)
         if arm is not None:
             _send(self._moving, arm.transforms(seen.arm_joints), stamp)
@@ -101,9 +89,10 @@ class ScenePublishers:
     def goal(self, goal: Observation, stamp: Time) -> None:
         """Publish the goal of a scene."""
         self._publishers['goal/objects'].publish(_objects(goal, stamp))
-        self._publishers['goal/image'].publish(encode_image(goal.image, stamp, CAMERA_FRAME))
+        self._publishers['goal/image'].publish(
+            ros_messages.encode_image(goal.image, stamp, CAMERA_FRAME))
         self._publishers['goal/robot_mask'].publish(
-            encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
+            ros_messages.encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
 
     def frames(self, world: World, stamp: Time) -> None:
         """Tell where the cameras and the ends of the arm are in this scene."""
@@ -111,7 +100,7 @@ class ScenePublishers:
         if world.camera_pose is not None:
             fixed.append(Transform(WORLD_FRAME, CAMERA_FRAME, world.camera_pose))
             place, turn = _fields(world.camera_pose)
-            self._pose.publish(make_message(PoseStamped, {
+            self._pose.publish(ros_messages.make_message(PoseStamped, {
                 'header': {'stamp': {'sec': stamp.sec, 'nanosec': stamp.nanosec},
                            'frame_id': WORLD_FRAME},
                 'pose': {'position': place, 'orientation': turn}}))
@@ -122,7 +111,7 @@ class ScenePublishers:
 
 def _objects(observation: Observation, stamp: Time) -> ObjectStates:
     """Encode the objects of an Observation, which come from the simulator itself."""
-    return encode_objects(
+    return ros_messages.encode_objects(
         observation.object_names, observation.object_pixels, observation.object_poses, stamp,
         WORLD_FRAME, ObjectStates.SOURCE_GROUND_TRUTH)
 
@@ -138,7 +127,7 @@ def _send(publisher: Any, transforms: Iterable[Transform], stamp: Time) -> None:
             'header': {'stamp': {'sec': stamp.sec, 'nanosec': stamp.nanosec}, 'frame_id': parent},
             'child_frame_id': child,
             'transform': {'translation': place, 'rotation': turn}})
-    publisher.publish(make_message(publisher.msg_type, {'transforms': fields}))
+    publisher.publish(ros_messages.make_message(publisher.msg_type, {'transforms': fields}))
 
 
 def _fields(pose: np.ndarray) -> tuple[dict[str, float], dict[str, float]]:

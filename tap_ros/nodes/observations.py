@@ -65,7 +65,7 @@ class Observations:
 
     def __init__(self, *topics: str, latched: bool = False) -> None:
         self._topics, self._latched = topics, latched
-        self._changed = threading.Condition()
+        self._changed = threading.Condition()  # reentrant
         # stamp in ns -> {topic: (message, received)}
         self._by_stamp: OrderedDict[int, dict[str, tuple[Any, float]]] = OrderedDict()
         self._newest: dict[str, int] = {}  # topic -> stamp in ns
@@ -113,8 +113,7 @@ class Observations:
                 subscribe(CompressedImage, f'{name}/compressed')
         if not (self._latched or on_demand):
             node.create_subscription(
-                Clock, 'clock', lambda message: self.tell_time(to_nanoseconds(message.clock)),
-                qos_profile_sensor_data, callback_group=group)
+                Clock, 'clock', self._on_clock, qos_profile_sensor_data, callback_group=group)
         if not on_demand:
             adapt_regularly(node, [one for _, one in made], callback_group)
             return
@@ -178,8 +177,7 @@ class Observations:
             self._by_stamp.move_to_end(stamp)
             while len(self._by_stamp) > DEPTH * len(self._topics):
                 self._by_stamp.popitem(last=False)
-            self.count += 1
-            self._changed.notify_all()
+            self.wake()
 
     def attach(self, topic: str, stamp: int, message: Any, received: float) -> None:
         """
@@ -191,13 +189,15 @@ class Observations:
             parts = self._by_stamp.get(stamp)
             if parts is not None:
                 parts[topic] = message, received
-                self.count += 1
-                self._changed.notify_all()
+                self.wake()
 
     def note(self, topic: str, received: float) -> None:
         """Note the reception of something from which messages of a topic are derived."""
         with self._changed:
             self._received[topic] = received
+
+    def _on_clock(self, message: Clock) -> None:
+        self.tell_time(to_nanoseconds(message.clock))
 
     def tell_time(self, now_ns: int) -> None:
         """Take the time of a message of /clock."""

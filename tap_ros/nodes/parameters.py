@@ -97,6 +97,55 @@ class Parameters:
             default, description, limits = SHARED[name]
             self.declare(name, defaults.get(name, default), description, **limits)
 
+    def declare_arm(self) -> None:
+        """Declare arm, mount and opening: used for joint states that lack the gripper's."""
+        arm = self.declare(
+            'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
+            'joints and not gripper_x.', choices=names('tap_ros.arms'))
+        self.declare_mount(arm)
+        self.declare('fixed_opening', 0.0,
+                     'Opening of the gripper, 0 to 1, where no joint_states has '
+                     'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
+
+    def declare_mount(self, arm: str) -> None:
+        """Declare the place of an arm; by default at the simulated table."""
+        default = get_arm(arm).mount
+        for axis, value in zip('xyz', default.position):
+            self.declare(
+                f'mount_{axis}', value, f'{axis} of the base of the arm in the world, m; of its '
+                'controller\'s frame "base".', low=-10.0, high=10.0)
+        self.declare('mount_turn', default.yaw,
+                     'Turn of that frame about the vertical, rad; the base stands upright.',
+                     low=-2 * math.pi, high=2 * math.pi)
+        self.declare('tool_length', default.tool,
+                     'From the flange to the fingertips along its z, m.', low=0.0, high=2.0)
+
+    def declare_camera(self, frame: str) -> None:
+        """Declare the pose of the camera in a frame, and what counts of its camera_info."""
+        for axis in 'xyz':
+            self.declare(f'camera_{axis}', 0.0, f'{axis} of the camera in {frame}, m.',
+                         low=-100.0, high=100.0)
+        for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
+            self.declare(
+                f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
+                f'optical frame (z forward, x right, y down in the picture) into {frame}.',
+                low=-1.0, high=1.0)
+        self.declare('rectified', False,
+                     'The pictures are rectified: P of camera_info counts, else K.')
+
+    def camera_pose(self) -> np.ndarray:
+        """
+        Return the pose (4, 4) of the camera, by the parameters of declare_camera.
+
+        :raises ConfigError: for a quaternion of length 0.
+        """
+        place, quaternion = ([self[f'camera_{axis}'] for axis in axes]
+                             for axes in ('xyz', ('qx', 'qy', 'qz', 'qw')))
+        try:
+            return pose_matrix(place, quaternion)
+        except ConfigError as error:
+            raise ConfigError(f'parameters camera_qx to camera_qw: {error}') from error
+
     def _check_choices(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse strings that are none of the choices."""
         for parameter in parameters:
@@ -118,59 +167,6 @@ def check_device(device: str) -> None:
     import torch  # here, since it takes seconds, and not every node has a device
     if device == 'cuda' and not torch.cuda.is_available():
         raise ConfigError('parameter device: torch finds no GPU for cuda; valid here: cpu')
-
-
-def declare_arm(parameters: Parameters) -> None:
-    """Declare arm, mount and gripper opening: used for joint states that lack the gripper's."""
-    arm = parameters.declare(
-        'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
-        'joints and not gripper_x.', choices=names('tap_ros.arms'))
-    declare_mount(parameters, arm)
-    parameters.declare('fixed_opening', 0.0,
-                       'Opening of the gripper, 0 to 1, where no joint_states has '
-                       'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
-
-
-def declare_mount(parameters: Parameters, arm: str) -> None:
-    """Declare the place of an arm; by default at the simulated table."""
-    default = get_arm(arm).mount
-    for axis, value in zip('xyz', default.position):
-        parameters.declare(
-            f'mount_{axis}', value, f'{axis} of the base of the arm in the world, m; of its '
-            'controller\'s frame "base".', low=-10.0, high=10.0)
-    parameters.declare('mount_turn', default.yaw,
-                       'Turn of that frame about the vertical, rad; the base stands upright.',
-                       low=-2 * math.pi, high=2 * math.pi)
-    parameters.declare('tool_length', default.tool,
-                       'From the flange to the fingertips along its z, m.', low=0.0, high=2.0)
-
-
-def declare_camera(parameters: Parameters, frame: str) -> None:
-    """Declare the pose of the camera in a frame, and what counts of its camera_info."""
-    for axis in 'xyz':
-        parameters.declare(f'camera_{axis}', 0.0, f'{axis} of the camera in {frame}, m.',
-                           low=-100.0, high=100.0)
-    for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
-        parameters.declare(
-            f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
-            f'optical frame (z forward, x right, y down in the picture) into {frame}.',
-            low=-1.0, high=1.0)
-    parameters.declare('rectified', False,
-                       'The pictures are rectified: P of camera_info counts, else K.')
-
-
-def camera_pose(parameters: Parameters) -> np.ndarray:
-    """
-    Return the pose (4, 4) of the camera, by the parameters of declare_camera.
-
-    :raises ConfigError: for a quaternion of length 0.
-    """
-    place, quaternion = ([parameters[f'camera_{axis}'] for axis in axes]
-                         for axes in ('xyz', ('qx', 'qy', 'qz', 'qw')))
-    try:
-        return pose_matrix(place, quaternion)
-    except ConfigError as error:
-        raise ConfigError(f'parameters camera_qx to camera_qw: {error}') from error
 
 
 def pose_matrix(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:

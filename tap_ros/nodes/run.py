@@ -13,12 +13,7 @@ import threading
 from typing import Any
 
 import rclpy
-from rclpy.executors import (
-    Executor,
-    ExternalShutdownException,
-    MultiThreadedExecutor,
-    SingleThreadedExecutor,
-)
+from rclpy import executors
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from tap_ros.contract import NODE_CLASSES
@@ -77,13 +72,13 @@ def main(name: str = '', args: list[str] | None = None) -> int:
         warn_of_unknown_parameters(node)
         _handle_signals(lambda *_: stop.set())
         num_threads = getattr(node_class, 'num_threads', 1)
-        executor = (SingleThreadedExecutor() if num_threads == 1
-                    else MultiThreadedExecutor(num_threads))
+        executor = (executors.SingleThreadedExecutor() if num_threads == 1
+                    else executors.MultiThreadedExecutor(num_threads))
         executor.add_node(node)
         heartbeat = Heartbeat(node)
         while rclpy.ok() and not stop.is_set():
             _spin_once(executor, node)
-    except (_Ended, KeyboardInterrupt, ExternalShutdownException):
+    except (_Ended, KeyboardInterrupt, executors.ExternalShutdownException):
         pass
     except (TapError, RuntimeError) as error:
         if not stop.is_set():  # else it is a consequence of the signal
@@ -157,11 +152,11 @@ def _handle_signals(handler: Callable[[int, Any], Any]) -> None:
         signal.signal(signal.SIGHUP, handler)
 
 
-def _spin_once(executor: Executor, node: Node) -> None:
+def _spin_once(executor: executors.Executor, node: Node) -> None:
     """Run what is ready; a signal is noticed after 0.1 s at most."""
     try:
         executor.spin_once(timeout_sec=0.1)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except (KeyboardInterrupt, executors.ExternalShutdownException):
         raise
     except Exception as error:
         log_error(node, 'a callback failed; the node goes on', error)

@@ -129,7 +129,7 @@ def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, frozenset[byte
         for topic in map(node.resolve_topic_name, topics)}
 
 
-def newcomers(node: Node, topics: Iterable[str], known: Mapping[str, frozenset[bytes]]) -> str:
+def rivals(node: Node, topics: Iterable[str], known: Mapping[str, frozenset[bytes]]) -> str:
     """
     Say how many publish a topic where one of them, such as a second camera, is new; else ''.
 

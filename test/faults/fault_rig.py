@@ -8,7 +8,7 @@ import signal
 import time
 
 from driven import Arm, goal_fields, MOVING_S, predict_fields, World
-from processes import Newest, NodeProcess
+from processes import Newest, NodeProcess, until
 from sensor_msgs.msg import JointState
 from tap_ros.contract import NODE_CLASSES
 from tap_ros.errors import TapError
@@ -126,7 +126,7 @@ class Rig:
         for _ in range(2):
             begin = time.monotonic()
             reaching = self.begin(**fields)
-            if self.arm.wait_for_moves(begin, 1):
+            if until(lambda begin=begin: self.arm.moves(begin), MOVING_S):
                 return reaching
             end = self.finish(reaching)
         raise TapError(f'nothing moved within {MOVING_S:g} s; the goal {end}')

@@ -8,23 +8,20 @@ topics with, fed by real publishers. The same messages, serialized as the record
 into a bag. Networks are trained on the second and served the first.
 """
 
-from contextlib import contextmanager
 import io
 import time
 from types import SimpleNamespace
 
 import numpy as np
 from PIL import Image as Picture
+from processes import Client
 import pytest
-from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage, Image, JointState
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import GRIPPER_JOINTS, ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.images.crop import Crop, TrainedCrop
-from tap_ros.nodes.calls import Spinner
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.predictor.requests import RequestReader
 from tap_ros.nodes.ros_messages import encode_image, encode_mask, encode_objects
@@ -44,18 +41,6 @@ PARAMS = {
     'joint_prefix': '', 'fixed_opening': 0.0, 'max_silence': 0.35, 'arm': DEFAULT_ARM,
     'mount_turn': ARM.mount.yaw, 'tool_length': ARM.mount.tool,
     **{f'mount_{axis}': value for axis, value in zip('xyz', ARM.mount.position)}}
-
-
-@contextmanager
-def running(name):
-    """Run a node in a thread."""
-    context = Context()
-    context.init()
-    node = Node(name, context=context)
-    with Spinner(node):
-        yield node
-    node.destroy_node()
-    context.try_shutdown()
 
 
 def pixels_of(t):
@@ -186,7 +171,7 @@ def test_what_is_seen_live_is_what_is_read_from_the_recording(
         tmp_path, picture, joints, part, robot_mask):
     sent = traffic(picture, joints)
     crop = TrainedCrop(part, SIZE, part.cut_size(SIZE))
-    with running('seeing') as node, running('publishing') as other:
+    with Client('seeing') as node, Client('publishing') as other:
         live = seen_live(node, other, crop, sent, picture is jpeg, robot_mask)
     assert len(live) == COUNT
     with BagWriter(tmp_path / 'bag') as writer:

@@ -3,6 +3,7 @@
 """All nodes as processes, over DDS, and how they are compared with one process."""
 
 from contextlib import contextmanager, suppress
+from pathlib import Path
 import threading
 
 from experiments.planning.episode import run_episode
@@ -10,10 +11,8 @@ from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from processes import Client, Newest, NodeProcess, until
-from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import Image, JointState
 from sim_bridge.simulator import Simulator
 from std_msgs.msg import Float64
@@ -29,8 +28,11 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import FORWARD_MODEL
 import torch
+import yaml
 
 SEED = 1_000_003
+CONFIG = yaml.safe_load((Path(__file__).parents[2] / 'config' / 'tap_ros.yaml').read_text())
+USUAL = CONFIG['/**/visual_mpc_node']['ros__parameters']
 
 
 class Loop:
@@ -71,25 +73,18 @@ class Loop:
         self.distances.clear()
 
     @contextmanager
-    def set(self, name, **parameters):
-        """Change parameters of a node for a while."""
-        client = AsyncParameterClient(self.node, name)
-
-        def answer(future):
-            assert until(future.done)
-            return future.result()
-
+    def set(self, **parameters):
+        """Change parameters of the planner for a while."""
         def change(values):
-            results = answer(client.set_parameters(values)).results
-            assert all(result.successful for result in results), results
+            answer = self.client.call('set_planner', parameters=[
+                Parameter(name, value=value).to_parameter_msg() for name, value in values.items()])
+            assert all(result.successful for result in answer.results), answer
 
-        before = answer(client.get_parameters(list(parameters))).values
-        change([Parameter(name, value=value) for name, value in parameters.items()])
+        change(parameters)
         try:
             yield
         finally:
-            change([ParameterMessage(name=name, value=value)
-                    for name, value in zip(parameters, before)])
+            change({name: USUAL[name] for name in parameters})
 
     def wait_until_seen(self):
         """

@@ -159,26 +159,6 @@ def test_a_mode_is_that_of_the_weights_or_refused(services):
         assert all(word in message for word in words), message
 
 
-def test_why_there_are_no_maps_is_said_of_each_picture(services):
-    plain = services['plain']
-    response = plain.answer(num_samples=5, recursion_depth=2, **WITH_GOAL)
-    assert list(response.sample) == [0, 0] and list(response.level) == [2, 1]
-    assert 'one sample instead of 5' in response.message, 'these have no z'
-    response = plain.answer(start=START, goal=GOAL, start_objects=START_OBJECTS)
-    assert response.message.endswith('no object maps: goal_objects are empty')
-    image = plain.publisher(Image, 'goal/image', LATCHED)
-    image.publish(GOAL)
-    plain.until('no object maps: nothing has come on /plain/goal/objects', **ALONE)
-    goal_objects = plain.publisher(ObjectStates, 'goal/objects', LATCHED)
-    goal_objects.publish(objects([(12, 13), (24, 17)], stamp=to_stamp(1_250_000_000)))
-    response = plain.until('/plain/goal/objects has the stamp 1.250000000 s', **ALONE)
-    assert 'the picture on /plain/goal/image 2.500000000 s' in response.message
-    assert 'start' not in response.message
-    goal_objects.publish(GOAL_OBJECTS)
-    response = plain.until('maps of cup, box', **ALONE)
-    assert response.subgoals == plain.answer(**WITH_GOAL).subgoals
-
-
 def test_a_picture_whose_robot_mask_is_missing_is_refused(services):
     masked = services['masked']
     masked.answer(start=START, goal=GOAL)  # what a request brings along stays as it is

@@ -49,7 +49,7 @@ def aborted(loop, *words, **fields):
 
 def test_the_nodes_go_directly_as_one_process_does_and_within_limits(loop):
     acts_like(loop, 'direct', DEFAULT_PREDICTOR, mode='direct', step_budget=4)
-    with loop.set('visual_mpc_node', max_step_xy=0.02, max_step_z=0.04):
+    with loop.set(max_step_xy=0.02, max_step_z=0.04):
         loop.reset()
         loop.reached(mode='direct', step_budget=2, seed=5)
     limit = np.array([0.02, 0.02, 0.04])
@@ -59,7 +59,7 @@ def test_the_nodes_go_directly_as_one_process_does_and_within_limits(loop):
 
 def test_the_nodes_go_by_subgoals_as_one_process_does_and_tell_what_they_do(loop):
     overlay = Newest(loop.node, Image, 'plan/overlay', STREAM)
-    with loop.set('visual_mpc_node', subgoal_rounds=2, switch='half'):
+    with loop.set(subgoal_rounds=2, switch='half'):
         run, told, result = acts_like(loop, 'shipped:rounds2:half', DEFAULT_PREDICTOR,
                                       step_budget=4)
     assert run.switches == [2, 3] and len(run.subgoals) == 2
@@ -74,7 +74,7 @@ def test_the_nodes_go_by_subgoals_as_one_process_does_and_tell_what_they_do(loop
     assert loop.distances[-1] == result.expected_distance == pytest.approx(away, abs=1e-3)
     shown = decode_image(overlay.wait(10), 'plan/overlay', (384, 384))
     assert (shown == CHOSEN).all(-1).sum() > 30
-    with loop.set('visual_mpc_node', switch='half', goal_tolerance=30.0):
+    with loop.set(switch='half', goal_tolerance=30.0):
         loop.reset()
         result = loop.reached(step_budget=4, seed=SEED)
     assert result.success and not len(loop.moves())
@@ -151,7 +151,7 @@ def test_when_the_predictor_hangs_or_dies_the_arm_stays_and_the_planner_lives(lo
         assert until(lambda: loop.predictor_alive.dead, 10)
         with pytest.raises(CallError, match='predictor_node, has ended'):
             loop.client.call('predict')
-        with loop.set('visual_mpc_node', predictor_timeout=0.5):
+        with loop.set(predictor_timeout=0.5):
             aborted(loop, '/predict_subgoal', step_budget=2)
     finally:
         predictor.send(signal.SIGCONT)

@@ -86,13 +86,13 @@ def test_without_a_robot_or_its_joints_there_is_no_mask_and_the_reason(client):
     cameras = client.create_publisher(CameraInfo, 'alone/camera/camera_info', STREAM)
     diagnostics = Newest(client, DiagnosticArray, '/diagnostics', 10)
     camera = encode_camera_info(np.eye(3), (64, 64), to_stamp(10**9), 'eye')
+    client.create_timer(0.1, lambda: cameras.publish(camera))
     for parameters, words in (
             ({}, 'nothing that can be used has come on robot_description'),
             ({'urdf': 'ur10e'}, 'nothing is known of shoulder_pan_joint')):
         node = LocalNode(RobotMaskNode, '/alone', **CAMERA, **parameters)
 
         def tells_why(message, words=words):
-            cameras.publish(camera)
             return any(words in pair.value for status in message.status for pair in status.values)
 
         try:

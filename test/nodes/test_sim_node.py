@@ -149,12 +149,9 @@ def test_a_goal_that_is_moved_is_published_as_that_of_a_reset(rig):
 def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(rig):
     rig.reset(seed=5)
     *_, goal = rig.goal(rig.image.wait(10).header.stamp)
-    _, second = goal.objects
-    count = rig.goal_image.count
-    for pixels, words in (
-            ({}, 'objects.* empty.* object_0, object_1'),
-            ({'object_1': (64, 30)}, 'object_1.*64.*63.5'),
-            ({'object_1': (63, 10)}, 'object_1.* out of reach.* 0.35 m')):
+    second, count = goal.objects[1], rig.goal_image.count
+    for pixels, words in (({'object_1': (64, 30)}, 'object_1.*64.*63.5'),
+                          ({'object_1': (63, 10)}, 'object_1.* out of reach.* 0.35 m')):
         with pytest.raises(CallError, match=words):
             rig.client.set_goal(pixels)
     # Poses do not count: it stays where its pixel is.
@@ -162,12 +159,8 @@ def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(rig):
     rig.client.call('set_goal', objects=ObjectStates(objects=[second]))
     rig.goal_image.wait(10, lambda m: m.header.stamp != goal.header.stamp)
     assert rig.goal_image.count == count + 1, 'nothing was published for what was refused'
-    rig.reset(task='grasp', seed=1)
-    with pytest.raises(CallError, match='(?=.*grasp).*push2'):
-        rig.client.set_goal({'object_0': (30, 30)})
-    for task in ('push3', 'push2'):
-        rig.reset(task=task, seed=1)
-        rig.objects.wait(10, lambda m, count=int(task[-1]): len(m.objects) == count)
+    rig.reset(task='push3', seed=1)
+    rig.objects.wait(10, lambda m: len(m.objects) == 3)
 
 
 def test_what_answers_no_picture_lets_no_time_pass(rig):

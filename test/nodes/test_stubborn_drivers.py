@@ -111,3 +111,14 @@ def test_an_input_that_falls_silent_stops_the_arm_and_no_goal_begins(rig):
         assert result.end == 'aborted' and name in result.message, result.message
         assert 1 <= moves == result.steps < 40
     rig.aborted(name)
+
+
+def test_an_object_in_doubt_ends_the_goal_with_its_name(rig):
+    for state in ('unsure', 'lost'):
+        rig.world.states = ['seen', 'hidden']  # it goes on
+
+        def doubt(_, state=state):
+            rig.world.states = ['seen', state]
+        result, moves = rig.reach(40, doubt)
+        assert result.end == 'aborted' and 1 <= result.steps == moves < 40
+        assert f'object_1 {"is " * (state == "unsure")}{state}' in result.message

@@ -200,7 +200,8 @@ class ExplorerCalls:
     def _reach(self, mode: str) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self.stage = f'{words}: waiting for the planner'
-        if self._cancelled:
+        cancelled = self._cancelled
+        if cancelled:
             raise CallError(f'{words}: cancelled before it began')
         goal = self._client.reach(
             mode=mode, on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)

@@ -19,16 +19,8 @@ from tap_ros.messages.images import is_empty
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
+from tap_ros.nodes.explorer import display
 from tap_ros.nodes.explorer.browser_commands import ExplorerCalls
-from tap_ros.nodes.explorer.display import (
-    grips,
-    listed,
-    picture_bytes,
-    picture_of,
-    Place,
-    silence,
-    SILENT_S,
-)
 from tap_ros.nodes.explorer.goal import GoalByHand
 from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.observations import reception_time
@@ -197,37 +189,38 @@ class ExplorerNode(Node):
         for kind in PICTURES:
             if kind in changed:
                 try:
-                    image = picture_of(newest[kind][0], kind)
+                    image = display.picture_of(newest[kind][0], kind)
                     self._sizes[kind] = image.shape[1], image.shape[0]
-                    self._server.put(kind, picture_bytes(image, kind == 'plan'))
+                    self._server.put(kind, display.picture_bytes(image, kind == 'plan'))
                 except TapError as error:
                     self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
         now, simulator = time.monotonic(), self._calls.offered('reset')
         self._server.put('state', json.dumps({
             'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
             'simulator': simulator,
-            'plans': not simulator or not grips(self._task),
+            'plans': not simulator or not display.grips(self._task),
             'tracker': self._calls.offered('select'),
             'observer': self.count_publishers(OBSERVER) > 0,
             'movable': self._movable(bool(objects), bool(goals), 'goal' in newest),
             'camera': {**self.size('camera'),
-                       'objects': listed(objects, newest.get('objects', [None])[0]),
-                       'targets': listed({n: goals[n] for n in objects if n in goals}),
-                       'note': silence(now, newest.get('camera'))},
+                       'objects': display.listed(objects, newest.get('objects', [None])[0]),
+                       'targets': display.listed({n: goals[n] for n in objects if n in goals}),
+                       'note': display.silence(now, newest.get('camera'))},
             'goal': {**self.size('goal'),
-                     'objects': listed(goals, newest.get('goal_objects', [None])[0]),
+                     'objects': display.listed(goals, newest.get('goal_objects', [None])[0]),
                      'pictured': 'goal' in newest,
                      'note': '' if 'goal' in newest else 'none yet'},
             'problem': problem,
             'run': {'running': running, 'stage': self._calls.stage if running else '',
                     'text': self._calls.stage or 'starting' if running else 'idle'},
             'diagnostics': [
-                {'name': name, 'level': level, 'message': text} if now - came <= SILENT_S + 1 else
+                {'name': name, 'level': level, 'message': text}
+                if now - came <= display.SILENT_S + 1 else
                 {'name': name, 'level': STALE, 'message': 'silent'}
                 for name, (level, text, came) in sorted(self._states.items())],
             'log': log, 'log_count': log_count}))
 
-    def places(self, name: str) -> dict[str, Place]:
+    def places(self, name: str) -> dict[str, display.Place]:
         """Return the places of objects by name; empty where they cannot be used."""
         message, _ = self.newest.get(name, (ObjectStates(), 0.0))
         try:

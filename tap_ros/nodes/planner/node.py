@@ -25,17 +25,12 @@ from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import Client
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
+from tap_ros.nodes.planner import settings
 from tap_ros.nodes.planner.arm import ArmCommander
 from tap_ros.nodes.planner.goals import ask_subgoals, GoalSource
 from tap_ros.nodes.planner.plan_view import draw_plan
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
-from tap_ros.nodes.planner.settings import (
-    check_request,
-    declare_parameters,
-    load_planner,
-    reach_config,
-    weights_file,
-)
+from tap_ros.nodes.planner.settings import declare_parameters
 from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.services import reason
@@ -111,7 +106,7 @@ class VisualMpcNode(LifecycleBase):
     def load(self) -> str:
         """Load the weights; return device and file."""
         self._check_idle()
-        self._mpc = self._worker.submit(load_planner, self.params).result()
+        self._mpc = self._worker.submit(settings.load_planner, self.params).result()
         warn_if_unlike(self, self.params['robot_mask'], [self._model.config.robot_mask],
                        'forward model')
         return f'{self.params["device"]}, {self.params["weights"]}'
@@ -124,7 +119,7 @@ class VisualMpcNode(LifecycleBase):
 
     def files(self) -> list[Path]:
         """Return the file of the weights."""
-        return [weights_file(self.params['weights'])]
+        return [settings.weights_file(self.params['weights'])]
 
     def resume(self) -> None:
         """Serve goals again, once the last one has ended."""
@@ -213,11 +208,11 @@ class VisualMpcNode(LifecycleBase):
                result: ReachGoal.Result) -> None:
         """Show the loop what is seen since `accepted`, do what it answers, fill the result."""
         request = handle.request
-        mode = check_request(request)
+        mode = settings.check_request(request)
         self._goal.begin(request, mode)
         self._inputs.begin(accepted)
         self._refusals.clear()
-        config = reach_config(self.params, request)
+        config = settings.reach_config(self.params, request)
         reach = Reach(self._mpc, config, request.seed, accepted)
         while True:
             self._go_on(handle)

@@ -24,7 +24,7 @@ from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.nodes.observations import JUMP_NS, Observations, reception_time
 from tap_ros.nodes.parameters import declared_arm, Parameters
 from tap_ros.nodes.robot_view import RobotView
-from tap_ros.nodes.subscriptions import newcomers, publishers_of
+from tap_ros.nodes.subscriptions import publishers_of, rivals
 from tap_ros.nodes.topics import camera_topics, of_topic, STREAM
 from tap_ros.planning.reach import Seen
 
@@ -81,7 +81,7 @@ class PlannerInputs:
         :return: Seen, or None when nothing was; which sensors are silent, '' if none is.
         :raises TapError: for messages that cannot be used.
         """
-        rival = newcomers(self._node, self._names, self._publishers)
+        rival = rivals(self._node, self._names, self._publishers)
         if rival:
             raise PlanningError(
                 f'the scene has changed: {rival}; leave one, and send the goal again')

@@ -16,7 +16,7 @@ from tap_ros.contract import (
     WORLD_FRAME,
 )
 from tap_ros.errors import ConfigError
-from tap_ros.nodes.parameters import check_device, declare_arm, Parameters
+from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
@@ -84,7 +84,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('max_age', 3.0,
                        'Seconds; what was received longer ago is not acted upon, so a plan that '
                        'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
-    declare_arm(parameters)
+    parameters.declare_arm()
     parameters.declare('image_timeout', 5.0,
                        'Seconds without a usable observation after which a goal is aborted.',
                        low=0.1, high=600.0, read_only=False)

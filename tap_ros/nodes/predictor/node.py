@@ -16,26 +16,14 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.images.drawing import overlay
 from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
+from tap_ros.nodes import services
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.nodes.predictor import requests
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
-from tap_ros.nodes.predictor.requests import (
-    encode_answer,
-    MAX_ROWS,
-    MAX_TOGETHER,
-    MAX_WAITING,
-    PendingRequest,
-    RequestReader,
-)
 from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
-from tap_ros.nodes.services import (
-    create_deferred_service,
-    log_error,
-    reason,
-    take_pending_requests,
-)
 from tap_ros.nodes.subscriptions import steady_timer
 from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
@@ -62,21 +50,22 @@ class PredictorNode(LifecycleBase):
         super().__init__('predictor_node', **options)
         self.params = declare_parameters(self)
         self._predictor: Predictor | None = None
-        self._queue: RequestQueue[PendingRequest, Found] | None = None
+        self._queue: RequestQueue[requests.PendingRequest, Found] | None = None
         self.autostart('configure')
         goal = goal_topics(self.params['robot_mask'])
         self._diagnostics = Diagnostics(
             self, [name for _, name in camera_topics(self.params).values()],
             [name for _, name in goal.values()],
             queue=lambda: len(self._queue or ()), idle=self.why_not)
-        self._reader = RequestReader(self, self.params, self._diagnostics.received)
+        self._reader = requests.RequestReader(self, self.params, self._diagnostics.received)
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
         # The newest subgoal until it is published, by a timer: the answer does not wait for it.
-        self._unshown: deque[tuple[PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
+        self._unshown: deque[
+            tuple[requests.PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
         steady_timer(self, SHOW_PERIOD, self._on_timer)
-        self._service = create_deferred_service(
+        self._service = services.create_deferred_service(
             self, PredictSubgoal, 'predict_subgoal', self._on_request)
         self.autostart('activate')
 
@@ -84,21 +73,22 @@ class PredictorNode(LifecycleBase):
         """Refuse all waiting requests, and let the running batch end."""
         if self._queue is not None:
             self._queue.close()
-        take_pending_requests(self._service)  # each is refused: the node is ending
+        services.take_pending_requests(self._service)  # each is refused: the node is ending
         self._show()
 
     # Lifecycle
 
     def load(self) -> str:
         """Load the weights, in the thread that will use them; return what is known of them."""
-        def prepare() -> Callable[[list[PendingRequest]], list[Found]]:
+        def prepare() -> Callable[[list[requests.PendingRequest]], list[Found]]:
             # OpenMP is slow where two threads have begun parallel work on few cores.
             check_device(self.params['device'])
             self._predictor = load_predictor(self.params['weights'], self.params['device'])
             return partial(predict, self._predictor)
 
         self._queue = RequestQueue(
-            prepare, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
+            prepare, lambda task: task.rows, requests.MAX_WAITING, requests.MAX_TOGETHER,
+            requests.MAX_ROWS)
         assert self._predictor is not None
         mode, (height, width) = self._predictor.mode, self._predictor.image_size
         trained, share = trained_robot_mask(self._predictor.training)
@@ -148,17 +138,17 @@ class PredictorNode(LifecycleBase):
             self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
         except Exception as error:
             self._diagnostics.error(error)
-            log_error(self, 'subgoal', error)
+            services.log_error(self, 'subgoal', error)
 
     # In the thread of the queue
 
-    def _answer(self, task: PendingRequest, found: Found | Exception, send: Send,
+    def _answer(self, task: requests.PendingRequest, found: Found | Exception, send: Send,
                 begin: float) -> None:
         """Send the response to a task that was received at time `begin`."""
         try:
             if isinstance(found, Exception):
                 raise found
-            response = encode_answer(task, *found)
+            response = requests.encode_answer(task, *found)
             # Where to go first: the earliest subgoal of the first sample.
             shown = task, found[0][0], response.subgoals[0]
         except Exception as error:
@@ -179,17 +169,17 @@ class PredictorNode(LifecycleBase):
         else:
             self._diagnostics.error(error)
         return PredictSubgoal.Response(
-            success=False, message=reason(self, 'predict_subgoal', error))
+            success=False, message=services.reason(self, 'predict_subgoal', error))
 
     def _send(self, send: Send, response: PredictSubgoal.Response) -> None:
         """Send a response; its client may have gone."""
         try:
             send(response)
         except Exception as error:
-            log_error(self, 'predict_subgoal: a response cannot be sent', error)
+            services.log_error(self, 'predict_subgoal: a response cannot be sent', error)
 
 
-def predict(predictor: Predictor, tasks: list[PendingRequest]) -> list[Found]:
+def predict(predictor: Predictor, tasks: list[requests.PendingRequest]) -> list[Found]:
     """Predict a batch; return subgoals and ms for each PendingRequest."""
     begin = time.perf_counter()
     found = predictor.predict_together([task.question for task in tasks])

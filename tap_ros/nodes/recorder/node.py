@@ -12,7 +12,7 @@ from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError
 from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.parameters import declare_arm, Parameters
+from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.recorder.bags import Bags
 from tap_ros.nodes.ros_messages import message_class
 from tap_ros.nodes.services import answering
@@ -146,7 +146,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('compression', 'zstd', 'Compression of chunks.',
                        choices=['zstd', 'lz4', 'none'])
     parameters.declare_shared('image_transport')
-    declare_arm(parameters)
+    parameters.declare_arm()
     parameters.declare('record_on_start', True,
                        'Record from the start; else from the call of recorder/record on.')
     return parameters

@@ -18,13 +18,7 @@ from tap_ros.messages.joints import JointHistory
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import reception_time
-from tap_ros.nodes.parameters import (
-    camera_pose,
-    declare_camera,
-    declare_mount,
-    declared_mount,
-    Parameters,
-)
+from tap_ros.nodes.parameters import declared_mount, Parameters
 from tap_ros.nodes.ros_messages import encode_mask
 from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription, steady_timer
 from tap_ros.nodes.topics import LATCHED, STREAM
@@ -35,7 +29,7 @@ from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
 from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
 from tap_ros.text import escaped
 
-WAITING = 10  # pictures that may wait for their joint states
+WAITING = 100  # pictures that may wait for their joint states
 
 
 class RobotMaskNode(Node):
@@ -51,7 +45,7 @@ class RobotMaskNode(Node):
         super().__init__('robot_mask_node', **options)
         self.params = declare_parameters(self)
         self._light = declared_light(self.params)
-        self._camera = camera_pose(self.params)
+        self._camera = self.params.camera_pose()
         # CameraInfo of pictures that have no mask yet, and when they were received.
         self._waiting: deque[tuple[CameraInfo, float]] = deque(maxlen=WAITING)
         self._robot: Robot | None = None
@@ -70,7 +64,7 @@ class RobotMaskNode(Node):
             subscriptions.append(AdaptiveSubscription(
                 self, String, 'robot_description', self._on_description, LATCHED))
         adapt_regularly(self, subscriptions)
-        steady_timer(self, 0.2, self._give_up_waiting)
+        steady_timer(self, 0.2, self._answer_waiting)
         self.get_logger().info(f'ready: {self.params["urdf"] or "waits for robot_description"}')
 
     def close(self) -> None:
@@ -117,39 +111,29 @@ class RobotMaskNode(Node):
 
     def _answer_waiting(self) -> None:
         """Publish the masks of all pictures whose joints are known by now."""
-        if self._robot is None:
-            return
         for picture in list(self._waiting):
-            info, _ = picture
+            info, received = picture
             try:
-                mask = self._mask(self._robot, info)
+                mask = self._mask(info)
                 self._masks.publish(encode_mask(mask, info.header.stamp, info.header.frame_id))
-            except KinematicsError:  # of joints: they may come, see _give_up_waiting
-                continue
             except TapError as error:
+                waited = time.monotonic() - received
+                if isinstance(error, KinematicsError) and waited <= self.params['max_silence']:
+                    continue  # joints may come
                 self._tell(error)
             self._waiting.remove(picture)
 
-    def _give_up_waiting(self) -> None:
-        """Report why pictures that have waited for too long get no mask."""
-        while self._waiting and (
-                time.monotonic() - self._waiting[0][1] > self.params['max_silence']):
-            info, _ = self._waiting.popleft()
-            try:
-                if self._robot is None:
-                    raise KinematicsError('nothing that can be used has come on '
-                                          'robot_description; name a file by the parameter urdf')
-                self._mask(self._robot, info)
-            except TapError as error:
-                self._tell(error)
-
-    def _mask(self, robot: Robot, info: CameraInfo) -> np.ndarray:
+    def _mask(self, info: CameraInfo) -> np.ndarray:
         """
         Draw the mask of a picture.
 
-        :raises KinematicsError: when joints or camera are not known for its time.
+        :raises KinematicsError: when robot or joints are not known for its time.
+        :raises ImageError: for a camera that cannot be used.
         """
-        begin = time.perf_counter()
+        begin, robot = time.perf_counter(), self._robot
+        if robot is None:
+            raise KinematicsError('nothing that can be used has come on robot_description; name a '
+                                  'file by the parameter urdf')
         K, size = decode_camera_info(info, self.params['rectified'])
         found = self._history.at(to_nanoseconds(info.header.stamp), self.params['max_silence'])
         poses = robot.poses(dict(zip(robot.positions, found.positions)))
@@ -183,7 +167,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('hand_radius', 0.06,
                        'With a named arm: radius of a cylinder around the hand, from the flange '
                        'to the fingertips, m.', low=0.001, high=1.0)
-    declare_camera(parameters, 'base_frame')
+    parameters.declare_camera('base_frame')
     parameters.declare('base_frame', '',
                        'Link of the robot in which the pose of the camera is given; empty: its '
                        'root.')
@@ -202,7 +186,7 @@ def declare_parameters(node: Node) -> Parameters:
                        'Seconds; a picture without joint states nearer to it than this gets no '
                        'mask.', low=0.05, high=60.0, read_only=False)
     named = parameters['urdf'] in names('tap_ros.arms')
-    declare_mount(parameters, parameters['urdf'] if named else DEFAULT_ARM)
+    parameters.declare_mount(parameters['urdf'] if named else DEFAULT_ARM)
     return parameters
 
 

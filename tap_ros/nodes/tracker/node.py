@@ -25,30 +25,16 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE, JOINT_STATES
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import Moment, Observations, reception_time
-from tap_ros.nodes.parameters import (
-    camera_pose,
-    declare_arm,
-    declare_camera,
-    declared_arm,
-    Parameters,
-    pose_matrix,
-)
+from tap_ros.nodes.parameters import declared_arm, Parameters, pose_matrix
 from tap_ros.nodes.ros_messages import encode_objects
 from tap_ros.nodes.services import answering, log_error
 from tap_ros.nodes.subscriptions import (
     adapt_regularly,
     AdaptiveSubscription,
-    newcomers,
     publishers_of,
+    rivals,
 )
-from tap_ros.nodes.topics import (
-    camera_topics,
-    goal_topics,
-    LATCHED,
-    SERVICE_QOS,
-    STREAM,
-    to_stamp,
-)
+from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, SERVICE_QOS, STREAM
 from tap_ros.plugins import load_plugin, names
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.text import escaped, listing
@@ -90,7 +76,7 @@ class TrackerNode(Node):
         super().__init__('tracker_node', **options)
         self.params = declare_parameters(self)
         self._make = load_plugin('tap_ros.trackers', self.params['tracker'])
-        self._mounted = camera_pose(self.params) if self.params['camera_z'] else None
+        self._mounted = self.params.camera_pose() if self.params['camera_z'] else None
         self._lock = threading.RLock()  # of what follows
         self._selection: Selection | None = None
         self._info: CameraInfo | None = None
@@ -378,13 +364,13 @@ class TrackerNode(Node):
         """Say in what way the camera shows another scene than that of a selection, '' if not."""
         if self._sensors.jumps != selection.jumps:
             return 'the clock of its pictures has jumped: another camera, simulator or recording'
-        return newcomers(self, self._own_topics, selection.publishers)
+        return rivals(self, self._own_topics, selection.publishers)
 
     def _forget(self, why: str) -> None:
         """Follow nothing any more."""
         assert self._selection is not None
-        none = ObjectStates(source=ObjectStates.SOURCE_TRACKED)
-        none.header.stamp = to_stamp(self._selection.goal_ns or 0)
+        none = encode_objects((), np.empty((0, 2)), None, self._selection.goal_ns or 0, '',
+                              ObjectStates.SOURCE_TRACKED)
         self._selection = None
         if self._told_goal:
             self._goal_objects.publish(none)
@@ -427,8 +413,8 @@ def declare_parameters(node: Node) -> Parameters:
                        '(rigid), the forward model that plans (carried), or a tracker of another '
                        'package.', choices=names('tap_ros.trackers'))
     parameters.declare_shared('image_transport', 'joint_prefix', robot_mask='all')
-    declare_camera(parameters, f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
-    declare_arm(parameters)
+    parameters.declare_camera(f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
+    parameters.declare_arm()
     parameters.declare('max_silence', 0.35,
                        'Seconds; of a picture without joint states nearer to it than this the '
                        'gripper is not known.', low=0.05, high=60.0, read_only=False)
