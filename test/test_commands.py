@@ -131,21 +131,3 @@ def test_help_comes_without_what_takes_long_to_import():
             f'atexit.register(lambda: print("slow:", {slow} & set(sys.modules))); '
             'main(sys.argv[1:] + ["--help"])'), *command.split()], capture_output=True, text=True)
         assert run.returncode == 0 and run.stdout.splitlines()[-1] == 'slow: set()', command
-
-
-def test_a_shell_completes_commands_options_and_choices(tmp_path):
-    with pytest.raises(SystemExit):
-        main(['--tyro-write-completion', 'bash', str(tmp_path / 'tap_ros')])
-    complete = (
-        'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); '
-        'COMP_LINE="$*"; COMP_POINT=${#COMP_LINE}; '
-        '$(complete -p tap_ros | sed "s/.*-F //; s/ .*//"); echo "${COMPREPLY[@]}"')
-
-    def completed(*words):
-        return subprocess.run(['bash', '-c', complete, 'bash', tmp_path / 'tap_ros', 'tap_ros',
-                               *words], capture_output=True, text=True).stdout.split()
-
-    assert completed('ev') == ['evaluate']
-    assert {'prediction', 'planning'} <= set(completed('evaluate', ''))
-    assert completed('train', 'predictor', '--learning') == ['--learning-rate']
-    assert completed('collect', '--engine', '') == ['local', 'ray']

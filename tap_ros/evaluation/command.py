@@ -76,7 +76,7 @@ class Tracking:
 
     :param recordings: bag folders with object pixels; with --labels folders of films.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
-    :param labels: JSON file of pixels by hand, see tap_ros/evaluation/films.py.
+    :param labels: JSON file of pixels by hand, see tap_ros/evaluation/tracks.py.
     :param tracker: a name of the plugin group tap_ros.trackers.
     :param size: px of the longer side that pictures are scaled down to; 0: as they are.
     :param click: px of a picture 64 wide that clicks are off; 0: exact, and taken as they are.

@@ -3,31 +3,25 @@
 """Show what a recording or a weights file holds."""
 
 from collections import Counter
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import json
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
-from tap_ros.errors import ConfigError, ImageError
 from tap_ros.files import write_atomically
-from tap_ros.images.crop import CENTRE, check_trainable
+from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import film_strip, grid, png_bytes
 from tap_ros.options import File
 from tap_ros.recording.bags import check_first_picture, find_bags, list_topics
 from tap_ros.recording.cache import EpisodeStore, open_recordings
-from tap_ros.recording.columns import first_size
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.reading import Reading, reading_of, ReadingOptions
 from tap_ros.recording.topic_choice import find_topics
 from tap_ros.text import escaped, listing
 from tap_ros.training.split import split_episodes, warn_if_few
 from tyro import conf
-
-LARGE = 256  # px; pictures with a longer side are not decoded whole
-MANY = 5000  # pictures that take long
 
 
 @dataclass(frozen=True)
@@ -64,36 +58,17 @@ def run(args: Options) -> None:
         print(f'{"" if number else "topics":<11} {escaped(topic)}  {escaped(kind)}  '
               + ('unknown' if count is None else f'{count} messages'))
     reading = reading_of(args.reading)
-    shown = reading
-    try:
-        check_first_picture([args.path], reading, 'the predictor')
-        refusal = None
-    except ConfigError as error:
-        refusal = error
-        bags = find_bags(args.path)
-        size = first_size(bags[0], next(iter(find_topics(bags[0], reading.cameras[0]))))
-        with suppress(ImageError):  # whoever opens it is told
-            if size is not None and max(reading.cut.cut_size(size)) > LARGE:
-                # All of them would be gigabytes, and take minutes.
-                rate = max(0.5, 2 / reading.gap if reading.gap else 0)
-                shown = replace(reading, crop=reading.crop or CENTRE, size=64,
-                                rate=min(reading.rate or rate, rate))
+    check_first_picture([args.path], reading, 'the predictor')
     cameras = {next(iter(find_topics(bag, camera))) for bag in find_bags(args.path)
                for camera in reading.cameras}
-    count = sum(count or 0 for topic, _, count in found if topic in cameras)
-    if not shown.rate and count > MANY:
-        print(f'decoding    {count} pictures, 2 to 10 ms each on one core a file; the cache keeps '
-              'them for the next time', flush=True)
-    store = open_recordings([args.path], reading=shown)
+    store = open_recordings([args.path], reading=reading)
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})
     print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     if store.camera_size not in (store.image_size, None):
-        how = '' if shown == reading else (
-            f', here as with --crop {shown.crop} --size 64 --rate {shown.rate:g}')
-        print('cut         from pictures of {1}x{0} pixels{2}'.format(*store.camera_size, how))
+        print('cut         from pictures of {1}x{0} pixels'.format(*store.camera_size))
     print(f'told apart  {_told_apart(store, reading)}')
     print(f'camera      {listing(sorted(cameras))}')
     print(f'length      {lengths.min()} to {lengths.max()} frames, median {np.median(lengths):g}')
@@ -111,8 +86,6 @@ def run(args: Options) -> None:
                   for e in episodes[:args.episodes]]
         write_atomically(args.picture, png_bytes(grid(strips, scale=2)))
         print(f'picture     {escaped(args.picture)}')
-    if refusal is not None:
-        raise refusal
     check_trainable(store.image_size, 'the predictor')
     training, held_out = split_episodes(store)
     print(f'train       {len(training)} episodes to learn from, {len(held_out)} held out')

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.command import Tracking
-from tap_ros.evaluation.films import read_films
 from tap_ros.evaluation.intervals import bootstrap, share_interval
 from tap_ros.evaluation.tracks import (
     fit_camera,
     follow,
     longest_wrong,
+    read_films,
     recoveries,
     RIGHT,
     scaled,

@@ -1,16 +1,33 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a tracker makes of one episode or film, and how far that is from the truth."""
+"""
+What a tracker makes of one episode or film, and how far that is from the truth.
+
+Labels of films lie in a small JSON file; null where an object is not seen:
+
+    {"films": [
+    {"film": "0003/0.mp4", "objects": ["cup", "plate"], "first": 0, "last": 120, "step": 2,
+     "labels": {"0": [[101, 60], [150, 90]], "10": [[104, 61], null]}}
+    ]}
+
+A film is a path from a folder that is given with them. Pixels are (u, v) of the film's own size;
+every step-th frame from the first to the last is looked at; those of the first label are clicked.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+import json
+from pathlib import Path
 import time
+from typing import Any
 
 import cv2
 import numpy as np
-from tap_ros.errors import TrackingError
+from tap_ros.errors import ConfigError, TrackingError
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.formats.pictures import make_episode, video_frames
 from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.text import escaped
 from tap_ros.tracking.protocols import LOST, SEEN, Tracked, Tracker, View
 
 SIDE = 64  # errors are in pixels of a picture so many pixels wide
@@ -200,3 +217,36 @@ def fit_camera(episodes: Iterable[Episode]) -> PinholeCamera | None:
     to_camera[:3, :3] = cv2.Rodrigues(turns[0])[0]
     to_camera[:3, 3] = moves[0].ravel() - to_camera[:3, 2] * height
     return PinholeCamera(np.asarray(K), (size[0], size[1]), np.linalg.inv(to_camera))
+
+
+def read_films(labels: str | Path, folders: Sequence[str | Path]) -> list[Episode]:
+    """
+    Read films and their labels.
+
+    :param folders: where the films are looked for.
+    :raises ConfigError: for a file that is none of labels, or without films.
+    :raises RecordingError: for a film that cannot be read.
+    """
+    try:
+        told = json.loads(Path(labels).read_text())['films']
+        return [_film(one, folders) for one in told]
+    except (ValueError, LookupError, TypeError) as error:
+        raise ConfigError(f'{labels}: expected films with labels, see evaluation/tracks.py; '
+                          f'{escaped(error)}') from error
+
+
+def _film(told: dict[str, Any], folders: Sequence[str | Path]) -> Episode:
+    """Read one film."""
+    found = [path for folder in folders if (path := Path(folder, told['film'])).is_file()]
+    if not found:
+        raise ConfigError(f'{escaped(told["film"])} is in none of the folders of --recordings')
+    wanted = range(told.get('first', 0), told['last'] + 1, told.get('step', 1))
+    frames = [frame for i, (_, frame) in enumerate(video_frames(found[0])) if i in wanted]
+    T, K = len(frames), len(told['objects'])
+    pixels = np.full((T, K, 2), np.nan, np.float32)
+    for number, places in told['labels'].items():
+        for k, place in enumerate(places):
+            if place is not None:
+                pixels[wanted.index(int(number)), k] = place
+    return make_episode(frames, np.arange(T) / 10, tuple(told['objects']), object_pixels=pixels,
+                        object_source='by hand', task=told['film'])

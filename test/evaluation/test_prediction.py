@@ -15,9 +15,9 @@ from tap_ros.evaluation import command
 from tap_ros.evaluation.bottleneck import (
     bottleneck_scores,
     bottleneck_share,
-    MIN_MOTION,
 )
 from tap_ros.evaluation.hits import nearest_frame
+from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
@@ -173,14 +173,6 @@ def test_copying_matches_the_frame_beside_it_and_is_no_bottleneck():
     assert np.allclose(scores['copy-goal'].bottleneck, shorter, atol=1e-4)
 
 
-def test_episodes_in_which_an_object_stays_do_not_count_as_bottlenecks():
-    still = move_squares([[6, 6], [24, 16]], [[12, 10], [24, 16 + MIN_MOTION / 2]])
-    scores = evaluate(Pasting(), Store([*EPISODES, still]), range(4))['prediction']
-    assert np.isnan(scores.bottleneck).tolist() == [False, False, False, True]
-    assert scores.summary()['bottleneck_episodes'] == 3
-    assert scores.summary()['episodes'] == 4
-
-
 def network(**options):
     torch.manual_seed(0)
     made = PredictorNetwork(PredictorConfig(**{
@@ -295,3 +287,14 @@ def test_the_bottleneck_is_when_one_object_is_home_and_the_others_untouched(home
     assert np.isnan(bottleneck_share(replace(episode, object_pixels=both.astype(np.float32))))
     alone = replace(episode, object_pixels=pixels[:, :1].astype(np.float32))
     assert np.isnan(bottleneck_share(alone))
+
+
+def test_differences_are_paired():
+    baseline = np.random.default_rng(2).uniform(1, 5, 50)
+
+    def gain(errors):
+        return bootstrap(lambda a, b: 1 - a.mean(-1) / b.mean(-1), errors, baseline)
+
+    assert gain(0.75 * baseline) == pytest.approx((0.25, 0.25, 0.25))
+    _, low, high = gain(0.75 * baseline[::-1])
+    assert high - low > 0.1

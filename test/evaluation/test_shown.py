@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the score that says whether hand and objects are shown."""
 
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -40,11 +39,3 @@ def test_an_object_that_is_painted_over_is_not_shown(episode):
     without = cv2.inpaint(episode.frames[t], disc, 3, cv2.INPAINT_NS)
     hand, objects = ShownScorer(episode).score(without / 255, t)
     assert hand > 0.9 and objects < 0.3
-
-
-def test_nothing_is_known_without_masks_or_positions(episode):
-    frame = episode.frames[CARRYING] / 255
-    bare = replace(episode, robot_masks=None, goal_mask=None)
-    assert np.isnan(ShownScorer(bare).score(frame, CARRYING)).all()
-    lost = replace(episode, object_pixels=np.full_like(episode.object_pixels, np.nan))
-    assert np.isnan(ShownScorer(lost).score(frame, CARRYING)[1])

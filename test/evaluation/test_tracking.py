@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from tap_ros import plugins
 from tap_ros.errors import ConfigError, TrackingError
-from tap_ros.evaluation.films import read_films
 from tap_ros.evaluation.tracking import summarise
-from tap_ros.evaluation.tracks import fit_camera, follow, recoveries
+from tap_ros.evaluation.tracks import fit_camera, follow, read_films, recoveries
 from tap_ros.recording.episode import Episode
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.protocols import LOST, SEEN, Tracked

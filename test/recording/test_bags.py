@@ -12,8 +12,6 @@ import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.messages import encode
-from tap_ros.recording.writer import BagWriter
 import yaml
 import zstandard
 
@@ -78,18 +76,6 @@ def test_a_killed_recorder_leaves_a_readable_bag(tmp_path):
     assert shown([episode])[0] == [t % 256 for t in range(len(episode))]
 
 
-def test_bag_writer_refuses_unknown_and_changed_types(tmp_path, monkeypatch):
-    monkeypatch.setenv('AMENT_PREFIX_PATH', '')
-    with BagWriter(tmp_path / 'bag') as writer:
-        with pytest.raises(RecordingError, match='is not empty'):
-            BagWriter(tmp_path)
-        with pytest.raises(RecordingError, match='my_msgs/msg/Thing: no definition'):
-            writer.write_raw('/a', 'my_msgs/msg/Thing', b'', 0)
-        writer.write_raw('/a', 'std_msgs/msg/Float64', encode('std_msgs/msg/Float64', {}), 0)
-        with pytest.raises(RecordingError, match='/a has the type std_msgs/msg/Float64'):
-            writer.write_raw('/a', IMAGE, b'', 1)
-
-
 def test_metadata_that_cannot_be_used_is_named_in_one_line(bag):
     path = bag / 'metadata.yaml'
     good = path.read_text()
@@ -97,20 +83,12 @@ def test_metadata_that_cannot_be_used_is_named_in_one_line(bag):
     for text, words in (
             (good.replace('push2_1.mcap', 'push2_7.mcap'), 'not there: push2_7.mcap'),
             (good.replace('rosbag2_bagfile_information', 'nothing'), 'not the metadata'),
-            (begin + 'relative_file_paths: null', 'not the metadata'),
             (begin + 'relative_file_paths: [[a]]', 'not the metadata'),
-            (begin + 'relative_file_paths: [push2_0.mcap, push2_0.mcap]', 'a file twice'),
-            (begin + 'version: 2001-99-99', 'not the metadata'),
             (begin + 'relative_file_paths: [..]', 'not there'),
-            (begin + f'relative_file_paths: [{"a" * 5000}]', 'not there'),
-            (begin + 'relative_file_paths: ["a\\0b\\e[2J\\n"]', 'not')):
+            (begin + 'relative_file_paths: ["a\\0b\\e[2J\\n"]', 'not'), ('', ''),
+            ('!!python/object/apply:os.system [true]', 'not the metadata')):
         path.write_text(text)
         with pytest.raises(RecordingError, match=f'metadata.yaml.*{words}') as caught:
-            open_recordings(bag)
-        assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
-    for text in ('', 'null', '[]', '\0' * 100, '!!python/object/apply:os.system [true]'):
-        path.write_text(text)
-        with pytest.raises(RecordingError, match='metadata.yaml') as caught:
             open_recordings(bag)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
 

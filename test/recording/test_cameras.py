@@ -12,9 +12,9 @@ from made_episodes import make_episode
 import numpy as np
 from PIL import Image as Picture
 import pytest
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.errors import RecordingError
 from tap_ros.images.crop import Crop
-from tap_ros.recording.bags import check_first_picture, list_topics, reading_like
+from tap_ros.recording.bags import list_topics, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import encode
 from tap_ros.recording.reading import Reading
@@ -166,14 +166,6 @@ def test_a_topic_of_several_types_is_read_by_the_type_of_each_message(tmp_path):
         found, told = read(tmp_path / f'{number}.mcap')
         assert sum(map(len, found)) == expected and not told
     assert list_topics(tmp_path / '3.mcap') == [(name, IMAGE, 15), (name, string, 15)]
-
-
-def test_one_part_of_two_cameras_is_refused_before_training(tmp_path):
-    for name, size in (('a', (96, 128)), ('b', (120, 160))):
-        record_scenes(tmp_path / name, range(1, 5), size)
-    with pytest.raises(ConfigError, match='different sizes, 128x96, 160x120; --crop 0,0,96 is'):
-        check_first_picture([tmp_path], Reading(crop='0,0,96', size=64), 'x')
-    check_first_picture([tmp_path], Reading(crop='centre', size=64), 'x')
 
 
 def test_other_recordings_are_read_as_those_of_the_training(tmp_path):

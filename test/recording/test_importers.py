@@ -148,20 +148,6 @@ def test_each_video_is_a_demonstration_at_its_own_rate(tmp_path, capsys):
     assert code == 1 and 'is not empty' in said
 
 
-def test_a_folder_of_several_cameras_asks_for_one(tmp_path, capsys):
-    for demo in ('2', '10'):
-        for camera, level in (('front', int(demo) * 10), ('wrist', 200)):
-            (tmp_path / 'in' / demo).mkdir(parents=True, exist_ok=True)
-            write_video(tmp_path / 'in' / demo / f'{camera}.mp4',
-                        np.full((3, 48, 64, 3), level, np.uint8), 10.0)
-    words = 'import-video', tmp_path / 'in', '--out', tmp_path / 'bag'
-    code, said = run_import(capsys, *words)
-    assert code == 1 and '--camera: expected one of front, wrist' in said
-    assert run_import(capsys, *words, '--camera', 'front')[0] == 0
-    found = [episode.frames.mean() for episode in open_recordings(tmp_path / 'bag')]
-    assert np.abs(np.array(found) - [20, 100]).max() < 5
-
-
 @pytest.mark.skipif('TAP_ROS_REAL' not in os.environ, reason='TAP_ROS_REAL names no folder')
 @pytest.mark.parametrize('words', [
     ('import-video', 'droid_new_setup', '--camera', '0'),

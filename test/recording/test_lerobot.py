@@ -228,15 +228,3 @@ def test_frames_are_those_of_the_rows_times_and_of_one_episode_each(
     seen = np.concatenate([e.frames.mean((1, 2, 3)) for e in open_recordings(tmp_path / 'bag')])
     assert np.abs(seen - 15 * np.arange(16)).max() < 5
     assert any('within the one before' in str(each.message) for each in recwarn) == (second < 2)
-
-
-def test_rows_beyond_the_end_of_a_video_are_left_out(filmed, tmp_path, capsys, recwarn):
-    folder, key = filmed
-    rewrite(folder, 'data', lambda table: table.set_column(
-        0, 'timestamp', pyarrow.array(np.float32(table['timestamp']) * 3)))
-    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 0
-    assert re.search('7 pictures: videos/.* has no frame', str(recwarn[0].message))
-    assert [len(episode) for episode in open_recordings(tmp_path / 'bag')] == [6, 3]
-    (folder / f'videos/{key}/chunk-000/file-000.mp4').unlink()
-    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'b')]) == 1
-    assert '2 episodes: ' in (said := capsys.readouterr().err) and 'is not there' in said

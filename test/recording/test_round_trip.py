@@ -52,16 +52,6 @@ def test_round_trip_of_what_is_unusual(tmp_path):
         assert times == sorted(times)
 
 
-def test_same_episodes_give_the_same_bytes(tmp_path, episodes):
-    files = []
-    for name in ('one', 'two'):
-        (tmp_path / name).mkdir()
-        path = write(tmp_path / name / 'a.mcap', episodes)
-        write_metadata(tmp_path / name)
-        files.append((path.read_bytes(), (tmp_path / name / 'metadata.yaml').read_bytes()))
-    assert files[0] == files[1]
-
-
 def test_others_read_the_bag(bag, episodes):
     frames, twists, ends = [], [], []
     with AnyReader([bag]) as reader:
