@@ -67,7 +67,8 @@ def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str],
         for name, (track, why) in found.items():
             tracks[name] = track
             if why:
-                said.append(f'{called[name]}: its stamps {why}; log times take their place')
+                said.append(f'{called[name]}: its {len(track)} stamps {why}; log times take their '
+                            'place')
         if found and all(why for _, why in found.values()):  # the camera's clock is the odd one
             for name in ('goal', 'goal_mask', 'goal_object'):
                 track, ahead = tracks[name], int(np.median(frame.stamp - frame.log))

@@ -17,6 +17,7 @@ from itertools import chain
 from mmap import mmap
 from pathlib import Path
 import struct
+from typing import Any
 import zlib
 
 from mcap.data_stream import ReadDataStream
@@ -158,7 +159,7 @@ class McapFile:
 
     def _in_order(self) -> Iterator[tuple[int, McapRecord]]:
         """Yield (byte, record) of the records before the summary; note where they stop."""
-        stream = self._data if isinstance(self._data, mmap) else BytesIO(self._data)
+        stream: Any = self._data if isinstance(self._data, mmap) else BytesIO(self._data)
         stream.seek(0)
         records, start = StreamReader(stream, emit_chunks=True).records, len(MAGIC)
         with suppress(*_DAMAGE):
@@ -171,7 +172,8 @@ class McapFile:
 
     def _unpacked(self, start: int, chunk: Chunk | ChunkIndex) -> list[Found]:
         """Return the messages of a chunk, or of what the summary says of one, at a byte."""
-        times = chunk.message_start_time, chunk.message_end_time
+        first, last = (min(time, FAR) for time in (
+            chunk.message_start_time, chunk.message_end_time))
         try:
             if isinstance(chunk, ChunkIndex):  # the header of its record is not believed
                 index, end = chunk, start + chunk.chunk_length
@@ -185,7 +187,7 @@ class McapFile:
             return self._scan(breakup_chunk(chunk, validate_crc=True))
         except _DAMAGE as error:
             self.losses.append(Loss(f'it is damaged, restore the file from a copy: {error}',
-                                    'chunk', start, *(min(time, FAR) for time in times)))
+                                    'chunk', start, first, last))
             return []
 
     def _scan(self, records: Sequence[McapRecord]) -> list[Found]:

@@ -86,14 +86,16 @@ def test_records_of_both_kinds_come_in_the_order_of_their_files(make, task, tmp_
         assert set(np.diff(episode.stamps)) == {10**9 // 4}
 
 
-def test_a_camera_is_asked_for_and_episodes_in_which_it_shows_nothing_are_left_out(
-        tmp_path, capsys):
+def test_a_camera_is_asked_for_only_among_those_that_show_something(tmp_path, capsys):
     frames, wrist, blank = make_frames(0), make_frames(1), np.zeros_like(make_frames(0))
     file, out = tmp_path / 'a.tfrecord-00000-of-00001', tmp_path / 'bag'
     file.write_bytes(record(rlds(frames, image_1=blank)) + record(rlds(blank, image_1=blank)))
-    code, said = run_import(capsys, 'import-tfrecord', file, '--out', out, '--camera', 'image_0')
+    code, said = run_import(capsys, 'import-tfrecord', file, '--out', out)
     assert code == 0 and '1 episodes' in said and 'left out: 1 episodes' in said
-    file.write_bytes(record(rlds(frames, wrist=wrist)))
+    depth = rlds(frames, image_1=blank, wrist=wrist)
+    depth['steps/observation/depth'] = 6 * [cv2.imencode('.png', np.full((8, 8), 900, np.uint16))[
+        1].tobytes()]
+    file.write_bytes(record(depth))
     code, said = run_import(capsys, 'import-tfrecord', file, '--out', tmp_path / 'b')
     assert code == 1 and 'expected one of image_0, wrist\n' in said
     assert run_import(capsys, 'import-tfrecord', file, '--out', tmp_path / 'b', '--camera',

@@ -13,6 +13,7 @@ episodes.jsonl), data a row a frame. Pictures are files in the rows, or videos, 
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 import json
 from pathlib import Path
@@ -28,6 +29,7 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
 from tap_ros.recording.file_bytes import what_else
 from tap_ros.recording.formats.pictures import (
+    DAMAGE,
     decoded,
     Lacking,
     make_episode,
@@ -55,7 +57,7 @@ class Options(Target):
     Options of the command.
 
     :param path: folder of the data set, with meta/info.json.
-    :param camera: feature whose pictures are taken; needed where the set has several.
+    :param camera: feature whose pictures are taken; needed where the set has several of colour.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
@@ -87,7 +89,7 @@ class DataSet:
     A LeRobotDataset in a folder.
 
     :param folder: of the set.
-    :param camera: feature whose pictures are taken; '': the only one.
+    :param camera: feature whose pictures are taken; '': the only one of colour.
     :ivar rows: of meta/episodes, dicts in the order of the episodes, in the form of version 3.
     :ivar unused: features that are not taken over.
     :ivar lacking: what could not be used so far.
@@ -122,10 +124,11 @@ class DataSet:
         self.lacking = Lacking()
         self.marks: list[list[int]] = []
         self.rows = self._read_rows(count)
-        if camera not in cameras and (camera or len(cameras) != 1):
+        colour = [name for name in cameras if not self._is_depth(name)]
+        if camera not in cameras and (camera or len(colour) != 1):
             raise ConfigError(f'{escaped(self.folder)}: --camera: expected one of '
-                              f'{listing(cameras) or "its cameras, but there are none"}')
-        self.camera = camera or next(iter(cameras))
+                              f'{listing(colour or cameras) or "its cameras, but there are none"}')
+        self.camera = camera or colour[0]
         self._objects = self._object_names()
         taken = {self.camera, 'timestamp', SUBTASK, *INDICES, *filter(self._is_ours, NAMES)}
         if self._objects:
@@ -187,6 +190,18 @@ class DataSet:
         if len(rows) < count:
             self.lacking.note(f'meta/episodes tells of {len(rows)} of {count} episodes', '', '')
         return rows
+
+    def _is_depth(self, camera: str) -> bool:
+        """Tell whether a feature is of depth: by its description, or 16 bits a pixel."""
+        about = self.features[camera].get('info') or {}
+        if any(about.get(name) for name in ('video.is_depth_map', 'is_depth_map')):
+            return True
+        if self.features[camera]['dtype'] == 'video':
+            return False
+        with suppress(*DAMAGE):
+            data = self._file_of(self._rows_of(self.rows[0])[camera][0].as_py())
+            return data.startswith(b'\x89PNG') and data[24] == 16
+        return False
 
     def _path(self, pattern: object, row: dict[str, Any], part: str) -> Path:
         """Return the path of a file of an episode; part is data, or videos/ and the camera."""

@@ -10,6 +10,7 @@ and the instruction are taken; times are nominal, since records do not tell them
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import count
 import math
 from pathlib import Path
@@ -22,7 +23,7 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from google.protobuf.unknown_fields import UnknownFieldSet  # type: ignore[import-untyped]
 import google_crc32c
 import numpy as np
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import (
@@ -79,10 +80,17 @@ def _choose(features: dict[str, list[bytes]], camera: str) -> str:
     names = {match[1] or match[2] for name, value in features.items()
              if (match := re.fullmatch(r'steps/observation/(.+)|0/(.+)/encoded', name))
              and _is_picture(value[0] if value else b'')}
-    if camera not in names and (camera or len(names) != 1):
+    if camera in names:
+        return camera
+    first = {}  # picture of each camera, but of depth
+    for name in sorted(names):
+        with suppress(ImageError):
+            first[name] = _picture(_pictures(features, name)[0])
+    seen = [name for name, picture in first.items() if not _is_blank(picture)]
+    if camera or len(seen) > 1 or not first:
         raise ConfigError(f'--camera: {escaped(camera)}; expected one of '
-                          f'{listing(sorted(names)) or "those with pictures, but there are none"}')
-    return camera or names.pop()
+                          f'{listing(seen or first) or "those with pictures, but there are none"}')
+    return (seen or list(first))[0]
 
 
 def _pictures(features: dict[str, list[bytes]], camera: str) -> list[bytes]:
