@@ -8,11 +8,13 @@ import time
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
+from processes import until
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState
 from sim_bridge.simulator import Simulator
 from tap_msgs.msg import CommandRefused, ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import request_fields
 from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
 from tap_ros.nodes.topics import STREAM, to_stamp
@@ -56,6 +58,18 @@ def predict_fields(**fields):
     return request_fields(
         start.object_names, start=start.image, goal=goal.image, start_objects=start.object_pixels,
         goal_objects=goal.object_pixels) | fields
+
+
+def select(client, clicks):
+    """Select objects {name: (u, v)} once the tracker has a picture of the scene."""
+    def accepted():
+        try:
+            client.select(clicks)
+        except CallError as error:
+            assert 'no picture of the new' in str(error) or 'nothing has come' in str(error)
+            return False
+        return True
+    assert until(accepted)
 
 
 class World:

@@ -71,21 +71,6 @@ class Service(LocalNode):
         assert not len(response.sample) and not len(response.level)
         return response.message
 
-    def until(self, words, sends=(), **fields):
-        """Publish (publisher, message) and ask until the answer has these words; return it."""
-        def asked():
-            for publisher, message in sends:
-                publisher.publish(message)
-            response = self.ask(**fields)
-            return response if words in response.message else None
-
-        response = until(asked)
-        assert response is not None, f'no {words!r}, but: {self.ask(**fields).message}'
-        return response
-
-    def publisher(self, kind, topic, qos):
-        return self.client_node.create_publisher(kind, f'/{self.name}/{topic}', qos)
-
 
 @pytest.fixture(scope='module')
 def client():
@@ -162,9 +147,13 @@ def test_a_mode_is_that_of_the_weights_or_refused(services):
 def test_a_picture_whose_robot_mask_is_missing_is_refused(services):
     masked = services['masked']
     masked.answer(start=START, goal=GOAL)  # what a request brings along stays as it is
-    images = masked.publisher(Image, 'camera/image_raw', STREAM)
-    message = masked.until('camera/robot_mask', [(images, START)], goal=GOAL).message
-    assert '2.500000000 s' in message
+    images = masked.client_node.create_publisher(Image, '/masked/camera/image_raw', STREAM)
+
+    def refused():
+        images.publish(START)
+        message = masked.ask(goal=GOAL).message
+        return 'camera/robot_mask' in message and '2.500000000 s' in message
+    assert until(refused)
 
 
 def test_many_requests_at_once_get_their_own_answer_and_beyond_the_queue_busy(services):

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole path from clicks and a goal picture alone: no node is told the truth."""
 
-from driven import first_pictures, SEED
+from driven import first_pictures, SEED, select
 from loop import Loop
-from processes import NodeProcess, until
+from processes import NodeProcess
 import pytest
-from tap_ros.nodes.calls import CallError
 
 pytestmark = pytest.mark.slow
 PULLED = [word for topic in ('truth/objects', 'truth/goal/objects')
@@ -25,14 +24,7 @@ def test_clicks_and_a_goal_picture_are_enough(tmp_path, client):
             process.wait_for('ready', 120)
         assert not client.count_publishers('truth/objects')
         clicks = dict(zip(first.object_names, first.object_pixels.tolist()))
-
-        def selected():
-            try:
-                loop.client.select(clicks)
-            except CallError:  # no picture has come yet
-                return False
-            return True
-        assert until(selected)
+        select(loop.client, clicks)
         told = loop.goal_objects.wait(30)
         assert list(told.states) == ['seen', 'seen'] and told.source == 'tracked'
         assert loop.reach_client.wait_for_server(30)

@@ -4,6 +4,7 @@
 
 import json
 
+from driven import SEED, select
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from processes import LocalNode, Newest, NodeProcess, until
@@ -22,7 +23,7 @@ from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.nodes.tracker.node import TrackerNode
 from websockets.sync.client import connect
 
-SEED, SIZE = 1_000_003, 128
+SIZE = 128
 
 
 class Scene:
@@ -52,17 +53,6 @@ class Scene:
         _, names, pixels = self.at('truth/objects', stamp_ns)
         return dict(zip(names, pixels.tolist()))
 
-    def select(self, clicks):
-        """Select objects once the node has heard of the scene."""
-        def accepted():
-            try:
-                self.client.select(clicks)
-            except CallError as error:
-                assert 'no picture of the new' in str(error) or 'nothing has come' in str(error)
-                return False
-            return True
-        assert until(accepted)
-
     def move(self, *move):
         """Let one control period pass; return the stamp of the next picture."""
         command = TwistStamped(header=self.image.wait(10).header)
@@ -90,7 +80,7 @@ def scene(sim, client):
 
 def test_clicked_objects_are_followed_and_found_in_the_goal(scene, client):
     start_ns, goal_ns = scene.reset()
-    scene.select(scene.true_clicks(start_ns))
+    select(scene.client, scene.true_clicks(start_ns))
     for topic, stamp in (('objects', start_ns), ('goal/objects', goal_ns)):
         message, names, pixels = scene.at(topic, stamp)
         true, same, wanted = scene.at(f'truth/{topic}', stamp)
@@ -116,7 +106,7 @@ def test_clicked_objects_are_followed_and_found_in_the_goal(scene, client):
 def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(scene):
     start_ns, _ = scene.reset()
     clicks = scene.true_clicks(start_ns)
-    scene.select(clicks)
+    select(scene.client, clicks)
     scene.at('objects', start_ns)
     first, second = clicks.values()
     for asked, words in (
@@ -135,12 +125,12 @@ def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(
 
 def test_another_scene_or_camera_ends_the_selection(scene, client):
     start_ns, goal_ns = scene.reset()
-    scene.select(scene.true_clicks(start_ns))
+    select(scene.client, scene.true_clicks(start_ns))
     scene.at('goal/objects', goal_ns, lambda m: m.objects)
     start_ns, _ = scene.reset(SEED + 1)
     empty = scene.topics['goal/objects'].wait(10, lambda m: not m.objects)
     assert to_nanoseconds(empty.header.stamp) == goal_ns
-    scene.select(scene.true_clicks(start_ns))
+    select(scene.client, scene.true_clicks(start_ns))
     scene.at('objects', start_ns)
     client.create_publisher(Image, 'camera/image_raw', STREAM)
     scene.topics['goal/objects'].wait(10, lambda m: not m.objects)
@@ -165,7 +155,7 @@ def test_the_explorer_selects_proposes_and_moves_goals_of_objects_by_their_own_n
         def ask(do, **fields):
             page.send(json.dumps({'do': do, **fields}))
 
-        def select(clicks):
+        def click(clicks):
             ask('select', objects=[{'name': name, 'u': u, 'v': v}
                                    for name, (u, v) in clicks.items()])
 
@@ -173,7 +163,7 @@ def test_the_explorer_selects_proposes_and_moves_goals_of_objects_by_their_own_n
         first, second = scene.true_clicks(start_ns).values()
         count, text = 0, 'nothing has come'
         while 'nothing has come' in text:  # to the tracker yet
-            select({'corner': (SIZE + 3.0, 2.0)})
+            click({'corner': (SIZE + 3.0, 2.0)})
             problem = told('state', lambda state, last=count:
                            state['problem']['count'] > last)['problem']
             count, text = problem['count'], problem['text']
@@ -181,7 +171,7 @@ def test_the_explorer_selects_proposes_and_moves_goals_of_objects_by_their_own_n
         ask('propose')
         proposed = told('selection', lambda selection: selection['count'])
         assert not proposed['followed'] and len(proposed['objects']) == 2
-        select({'left': second, 'right': first})  # not the names of the simulator
+        click({'left': second, 'right': first})  # not the names of the simulator
         chosen = told('selection', lambda selection: selection['followed'] and selection['count'])
         for one in chosen['objects']:
             outline = np.array(one['outline'])
