@@ -112,16 +112,6 @@ def test_commands_that_are_shown_are_valid():
             assert any(each.startswith(known) for each in kinds()), command
 
 
-@pytest.mark.parametrize('line, named', [
-    ('', 'Expected one of {collect, import-video'), ('colect', 'colect'),
-    ('evaluate', 'planning'), ('evaluate nothing', 'nothing'), ('bench nothing', 'nothing'),
-    ('collect', '--out'), ('collect --out a --episodes many', '--episodes'),
-    ('collect --out a --nothing 3', '--nothing'), ('collect --out a b', 'b'),
-    ('train other', 'other'), ('import-video --out a', 'PATH'), ('paper --only', '--only')])
-def test_words_that_are_wrong_are_named(line, named, capsys):
-    assert named in refused(line, capsys)
-
-
 def test_help_comes_without_what_takes_long_to_import():
     for command, allowed in (('', ()), ('evaluate', ()), ('train predictor', ()),
                              ('evaluate planning', ('mujoco',))):

@@ -80,13 +80,6 @@ def test_an_interrupted_run_leaves_no_worker(tmp_path):
     assert not Path('/proc', begun[0].suffix[1:]).exists() and not path.exists()
 
 
-@pytest.mark.parametrize('engine, named', [
-    (('local', -1), 'workers'), (('local', 0, 'auto'), 'is for --engine ray')])
-def test_bad_engines_are_refused(engine, named):
-    with pytest.raises(ConfigError, match=named):
-        Engine(*engine)
-
-
 @pytest.mark.minutes
 def test_ray_gives_what_the_pool_gives_also_when_a_node_dies(tmp_path, monkeypatch):
     ray = pytest.importorskip('ray')

@@ -3,7 +3,6 @@
 """Laws of the pictures for people."""
 
 import numpy as np
-import pytest
 from tap_ros.images.drawing import overlay
 
 SCALE = 4
@@ -27,10 +26,9 @@ def test_the_overlay_shows_each_map_where_it_is():
     assert (marked != shown).any()
 
 
-@pytest.mark.parametrize('far', [20, -20, 5.4e8, -5.4e8, 3e38])
-def test_marks_outside_the_picture_are_not_seen_however_far(far):
+def test_marks_outside_the_picture_are_not_seen_however_far():
     start, maps = np.full((16, 16, 3), 128, np.uint8), np.zeros((0, 16, 16))
-    for pixel in ((far, 5), (5, far), (far, far)):
+    for pixel in ((20, 5), (5, -20), (-5.4e8, 5.4e8), (5, 3e38)):
         shown = overlay(start, maps, SCALE, np.array([pixel], np.float32),
                         np.array([pixel], np.float64))
         assert (shown == 128).all()

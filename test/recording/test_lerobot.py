@@ -78,20 +78,6 @@ def test_marks_are_the_ends_of_subtasks_and_come_back(truth, tmp_path, capsys):
         0: [(7, 7)], 2: [(3, 3), (10, 10)]}
 
 
-def test_the_statistics_are_those_of_the_numbers(exported, truth):
-    stats = json.loads((exported / 'meta' / 'stats.json').read_text())
-    pictures = np.concatenate([e.frames for e in truth]) / 255
-    for name, values, axes in (
-            (CAMERA, pictures, (0, 1, 2)), (ACTION, np.concatenate([e.actions for e in truth]), 0),
-            (STATE, np.concatenate([e.grippers for e in truth]), 0)):
-        for key, function in (('min', np.min), ('max', np.max), ('mean', np.mean),
-                              ('std', np.std), ('q50', np.median)):
-            # A median between two values of pixels is either of them.
-            np.testing.assert_allclose(
-                np.ravel(stats[name][key]), function(values.astype(float), axes), atol=1e-6)
-        assert stats[name]['count'] == [len(pictures)]
-
-
 def test_of_another_robot_pictures_are_taken_and_the_rest_is_named(
         exported, truth, tmp_path, capsys):
     foreign = shutil.copytree(exported, tmp_path / 'foreign')

@@ -61,10 +61,8 @@ def test_corners_contain_the_shapes_and_little_more():
 
 @pytest.mark.parametrize('old, new, words', [
     ('<box size="1 2 3"/>', '<mesh filename="a.stl"/>', 'link a has a mesh; expected box'),
-    ('size="1 2 3"', 'size="1 nan 3"', 'size="1 nan 3"; expected numbers: 3'),
     ('child link="b"', 'child link="x"', 'joint turn holds a link that is not there'),
     ('child link="c"', 'child link="b"', 'no tree'),
-    ('joint="slide"', 'joint="other"', 'follow mimics other'),
     ('<collision>', '<visual>', 'is no URDF'),
     ('<parent link="a"/>', '', 'joint turn lacks its parent')])
 def test_what_cannot_be_used_is_refused_in_one_line(old, new, words):
