@@ -16,7 +16,8 @@ from tap_ros.text import listing
 
 SIDE = 256  # pixels, height of the film's panels
 GAP, HEAD = 8, 26  # between panels, and above them for a line of text
-FRAME_MS, START_MS, HOLD_MS = 120, 2500, 3500  # of each picture, of the first and of the last
+# Of each picture; of the first, and where a run goes on from a subgoal; of the last.
+FRAME_MS, START_MS, HOLD_MS = 120, 2500, 3500
 QUALITY = 65  # of films, 0 to 100
 INK, GOOD, BAD = (34, 34, 34), (0, 110, 70), (190, 30, 45)
 GOAL = -1  # what a run heads for when it is no subgoal
@@ -132,8 +133,14 @@ def film(scene: Scene) -> bytes:
     first, *others = (Image.fromarray(_frame(scene, t)) for t in range(length))
     buffer = io.BytesIO()
     first.save(buffer, 'webp', save_all=True, append_images=others, quality=QUALITY, loop=0,
-               duration=[START_MS, *[FRAME_MS] * (length - 2), HOLD_MS])
+               duration=[*(_pause(scene, t) for t in range(length - 1)), HOLD_MS])
     return buffer.getvalue()
+
+
+def _pause(scene: Scene, t: int) -> int:
+    """Return the ms that step t is shown."""
+    goes_on = any(run.heading_at(t) != run.heading_at(t - 1) for run in scene.runs.values())
+    return START_MS if t == 0 or goes_on else FRAME_MS
 
 
 def _frame(scene: Scene, t: int) -> np.ndarray:
@@ -171,10 +178,13 @@ def _title(scene: Scene, mode: str, t: int) -> tuple[str, str, tuple[int, int, i
         heading = run.heading_at(t)
         name = ('Subgoal done, now the goal picture' if heading == GOAL else
                 f'Predicted subgoal: {scene.decided(run.subgoals[heading])}')
+    distances = run.distances[min(t, len(run.distances) - 1)]
+    left = f'{scene.numbers[distances.argmax()]} is {100 * distances.max():.0f} cm off'
     if t < len(run.distances) - 1:
-        return name, f'{100 * run.distances[t].mean():.0f} cm to go', INK, width
-    return name, (f'reached: {run.final_cm:.0f} cm' if run.reached
-                  else f'failed: {run.final_cm:.0f} cm'), GOOD if run.reached else BAD, width
+        return name, left, INK, width
+    limit = f'{100 * SUCCESS_DISTANCE:.0f} cm'
+    return name, (f'reached: all within {limit}' if run.reached else f'failed: {left}'), (
+        GOOD if run.reached else BAD), width
 
 
 def _line(left: str, right: str = '', colour: tuple[int, int, int] = INK,
