@@ -29,7 +29,6 @@ from tap_ros.contract import CAMERA_FRAME
 from tap_ros.errors import ConfigError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
-from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.calls import call, CallError, Reaching, Spinner
 from tap_ros.nodes.heartbeat import Liveness
@@ -338,10 +337,10 @@ class Client:
             silent = 'objects' if views.newest('image', after_ns=after_ns) else 'image'
             raise CallError(f'{views.names([silent], explained=True)}: '
                             f'nothing new came within {timeout_s:g} s')
-        listed = found.get('objects', ObjectStates())
-        return View(decode_image(found['image'], VIEWS[name]['image'][1]),
+        listed = found.messages.get('objects', ObjectStates())
+        return View(decode_image(found.messages['image'], VIEWS[name]['image'][1]),
                     *decode_objects(listed, VIEWS[name]['objects'][1]), positions_of(listed),
-                    to_nanoseconds(found['image'].header.stamp))
+                    found.stamp_ns)
 
 
 def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any]:

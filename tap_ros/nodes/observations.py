@@ -113,7 +113,7 @@ class Observations:
                 subscribe(CompressedImage, f'{name}/compressed')
         if not (self._latched or on_demand):
             node.create_subscription(
-                Clock, 'clock', self._on_clock, qos_profile_sensor_data, callback_group=group)
+                Clock, 'clock', self.on_clock, qos_profile_sensor_data, callback_group=group)
         if not on_demand:
             adapt_regularly(node, [one for _, one in made], callback_group)
             return
@@ -196,11 +196,9 @@ class Observations:
         with self._changed:
             self._received[topic] = received
 
-    def _on_clock(self, message: Clock) -> None:
-        self.tell_time(to_nanoseconds(message.clock))
-
-    def tell_time(self, now_ns: int) -> None:
-        """Take the time of a message of /clock."""
+    def on_clock(self, message: Clock) -> None:
+        """Take a message of /clock."""
+        now_ns = to_nanoseconds(message.clock)
         self._clock = now_ns, time.monotonic(), now_ns == self._clock[0]
 
     @property
@@ -244,19 +242,13 @@ class Observations:
             self._by_stamp.get(newest, {}).pop(topic, None)
 
     def newest(self, *topics: str, after_ns: int = -1,
-               since: float = -math.inf) -> dict[str, Any] | None:
+               since: float = -math.inf) -> Moment | None:
         """
-        Return the newest {topic: message} that has all of `topics`; None if there is none.
+        Return the newest Moment that has all of `topics`; None if there is none.
 
         :param after_ns: only what is stamped later than this.
         :param since: only what was received at or after this monotonic time.
         """
-        moment = self.moment(topics, after_ns, since)
-        return None if moment is None else moment.messages
-
-    def moment(self, topics: Collection[str], after_ns: int = -1,
-               since: float = -math.inf) -> Moment | None:
-        """Return the same as a Moment, with its stamp and time of reception."""
         self.poll()
         with self._changed:
             found = [stamp for stamp, parts in self._by_stamp.items() if stamp > after_ns and all(
@@ -269,7 +261,7 @@ class Observations:
                           min(parts[topic][1] for topic in topics))
 
     def wait(self, topics: Collection[str], timeout_s: float, after_ns: int = -1,
-             give_up: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
+             give_up: Callable[[], bool] = lambda: False) -> Moment | None:
         """
         Wait for an observation.
 
@@ -277,7 +269,7 @@ class Observations:
         :param timeout_s: most seconds to wait.
         :param after_ns: only what is stamped later than this.
         :param give_up: asked at every change and ten times a second whether to stop waiting.
-        :return: {topic: message}, or None when none came in time.
+        :return: a Moment, or None when none came in time.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:

@@ -147,7 +147,7 @@ def running_loop(folder):
             loop.start('recorder_node', folder=folder / 'bag')
             loop.start('sim_node', lock_step='true', observer='true')
             loop.start('predictor_node')
-            loop.start('visual_mpc_node', image_timeout=10.0, solver='quick')
+            loop.start('visual_mpc_node', image_timeout=10.0, preset='quick')
             for process in loop.processes.values():
                 process.wait_for('ready', 120)
             assert loop.reach_client.wait_for_server(30)
@@ -171,7 +171,7 @@ def acts_like(loop, method, weights, **fields):
     loop.reset()
     result = loop.reached(feedback.append, seed=SEED, **fields)
     sim = Simulator('push2')
-    mpc = VisualMPC.load(FORWARD_MODEL, with_preset('default', solver='quick'))
+    mpc = VisualMPC.load(FORWARD_MODEL, with_preset('quick'))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     plans, plan = [], mpc.plan

@@ -55,8 +55,8 @@ def test_what_was_latched_before_does_not_come_back(client):
                                on_demand=on_demand)
 
     def newest():
-        return [found['objects'].objects[0].u if (found := each.newest('objects')) else None
-                for each in (asked, observed)]
+        found = [each.newest('objects') for each in (asked, observed)]
+        return [one and one.messages['objects'].objects[0].u for one in found]
 
     assert until(lambda: newest() == [3, 3])
     by_hand = client.create_publisher(ObjectStates, 'goal/objects', QoSProfile(depth=1))

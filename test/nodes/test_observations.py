@@ -8,6 +8,7 @@ import threading
 import time
 
 import pytest
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
@@ -26,9 +27,9 @@ def put(observations, stamp, *topics):
 
 
 def stamp_of(found):
-    stamps = {to_nanoseconds(message.header.stamp) for message in found.values()}
-    assert len(stamps) == 1
-    return stamps.pop()
+    assert {to_nanoseconds(one.header.stamp) for one in found.messages.values()} == {
+        found.stamp_ns}
+    return found.stamp_ns
 
 
 def test_only_messages_of_the_same_stamp_go_together():
@@ -108,20 +109,20 @@ def test_what_repeats_a_stamp_is_as_old_as_the_first_unless_a_clock_says_that_ti
             seen.put('joints', stamped(Image, stamp), joints)
 
     receive(10, 1.0, 2.0)
-    assert seen.moment(('image', 'joints'), since=1.0).received == 1.0
-    assert seen.moment(('image', 'joints'), since=1.5) is None
+    assert seen.newest('image', 'joints', since=1.0).received == 1.0
+    assert seen.newest('image', 'joints', since=1.5) is None
     receive(10, 3.0)
-    seen.tell_time(10)  # once: it may run on
+    seen.on_clock(Clock(clock=to_stamp(10)))  # once: it may run on
     receive(10, 3.5)
     for stray in range(100, 100 + 3 * DEPTH):
         seen.put('joints', stamped(Image, stray), 3.6)
     receive(10, 3.7)  # long forgotten by its stamp
     assert seen.ages(('image', 'other'), 4.0) == {'image': 3.0, 'other': inf}
-    seen.tell_time(10)
+    seen.on_clock(Clock(clock=to_stamp(10)))
     receive(10, 3.9)
-    assert seen.moment(('image',), since=3.8).received == 3.9
+    assert seen.newest('image', since=3.8).received == 3.9
     assert seen.ages(('image',), 4.0)['image'] == pytest.approx(0.1)
-    seen.tell_time(11)
+    seen.on_clock(Clock(clock=to_stamp(11)))
     receive(10, 5.0)
     assert seen.ages(('image',), 5.0)['image'] == pytest.approx(1.1)
     receive(12, 6.0)
@@ -149,7 +150,7 @@ def test_topics_are_put_together_as_they_come_or_on_demand(client):
             publisher.publish(stamped(kind, stamp))
         if seen.wait(('image', 'joints'), 0.1):
             break
-    moment = seen.moment(('image', 'joints'))
+    moment = seen.newest('image', 'joints')
     assert begun <= moment.received <= time.monotonic()
     assert {topic: type(message) for topic, message in moment.messages.items()} == {
         'image': Image, 'joints': JointState}

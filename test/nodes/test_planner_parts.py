@@ -5,11 +5,8 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from sim_bridge.world.looks import get_look
-from tap_msgs.action import ReachGoal
 from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.errors import ConfigError
 from tap_ros.images.drawing import OBJECT_COLOURS
 from tap_ros.nodes.planner.plan_view import (
     CHOSEN,
@@ -21,7 +18,6 @@ from tap_ros.nodes.planner.plan_view import (
     SCALE,
     way,
 )
-from tap_ros.nodes.planner.settings import check_request, weights_file
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.weights import FORWARD_MODEL
 
@@ -31,19 +27,6 @@ ABOVE = ForwardModelConfig(
 HAND = np.array([0.1, -0.2, 0.05, 0.5], np.float32)
 GREY = np.full((64, 64, 3), 90, np.uint8)
 TARGETS = np.array([[20, 10], [50, 20]], np.float32)
-
-
-def test_budgets_and_samples_are_bounded():
-    for fields in ({'step_budget': 1000}, {'num_samples': 32}, {'recursion_depth': 100},
-                   {'mode': 'direct', 'num_samples': 100}):
-        assert check_request(ReachGoal.Goal(**fields)) == fields.get('mode', 'subgoal')
-    for fields, words in (
-            ({'step_budget': 1001}, '1001; expected 1 to 1000'),
-            ({'num_samples': 33}, '33 x 2 = 66; at most 64 plans')):
-        with pytest.raises(ConfigError, match=words):
-            check_request(ReachGoal.Goal(**fields))
-    with pytest.raises(ConfigError, match='grasp is a subgoal predictor.*push, push2'):
-        weights_file('grasp')
 
 
 def plan_of(*elites):

@@ -10,7 +10,6 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_ros.errors import PlanningError
 from tap_ros.messages.images import decode_image, is_empty
-from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
 from tap_ros.nodes.client import Client
 from tap_ros.nodes.observations import Observations
@@ -65,14 +64,14 @@ class GoalSource:
                     f'goal: nothing has come on {self._newest.names(missing, explained=True)}; '
                     'publish there (the simulator does at sim/reset), or send goal_image and '
                     'goal_objects along')
-            self._stamp = to_nanoseconds(found[needed[0]].header.stamp)
+            self._stamp = found.stamp_ns
             if 'image' in needed and self._robot.used and not self._newest.missing(['mask']):
                 found = self._newest.wait(
                     (*needed, 'mask'), MASK_TIMEOUT, self._stamp - 1, give_up) or found
-                mask = found.get('mask')
+                mask = found.messages.get('mask')
             # Where it is not needed, it says how large the picture is that the objects are in.
-            image = found.get('image', image) if is_empty(image) else image
-            objects = found['objects'] if 'objects' in needed else objects
+            image = found.messages.get('image', image) if is_empty(image) else image
+            objects = found.messages['objects'] if 'objects' in needed else objects
         picture = None if is_empty(image) else decode_image(image, 'goal')
         if picture is not None and mask is not None:
             picture = self._robot.fill_goal(picture, mask)
@@ -85,7 +84,7 @@ class GoalSource:
         :param since: monotonic time at which the request was accepted.
         :raises PlanningError: if the other goal was received later.
         """
-        newest = self._newest.moment(self._needed) if self._stamp is not None else None
+        newest = self._newest.newest(*self._needed) if self._stamp is not None else None
         if newest is None or newest.stamp_ns == self._stamp:
             return False
         if newest.received > since:

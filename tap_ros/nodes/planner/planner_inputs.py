@@ -86,7 +86,7 @@ class PlannerInputs:
             raise PlanningError(
                 f'the scene has changed: {rival}; leave one, and send the goal again')
         topics = self.topics
-        moment = self.sensors.moment(topics, since=self._since)
+        moment = self.sensors.newest(*topics, since=self._since)
         lacking = self._lacking(topics)
         if moment is None:
             return None, lacking or self._unmatched_joints() or (
@@ -105,7 +105,7 @@ class PlannerInputs:
 
     def newest_stamp(self) -> int:
         """Return the stamp of the newest picture that has come with its joints, in ns."""
-        moment = self.sensors.moment(('image', 'joints'))
+        moment = self.sensors.newest('image', 'joints')
         return moment.stamp_ns if moment is not None else -1
 
     def _scene_ns(self, stamp_ns: int) -> int:
@@ -157,7 +157,7 @@ class PlannerInputs:
             return
         if self._gripper.received > -math.inf:
             self.sensors.note('joints', self._gripper.received)
-            newest = self.sensors.moment(('image',))  # again, as joints that come again are newer
+            newest = self.sensors.newest('image')  # again, as joints that come again are newer
             for stamp_ns in {*self.sensors.without('joints', 'image'),
                              *([newest.stamp_ns] if newest else [])}:
                 self._match_joints(stamp_ns)
@@ -170,7 +170,7 @@ class PlannerInputs:
 
     def _unmatched_joints(self) -> str:
         """Return why the newest picture has no joints, where joints of an arm have come."""
-        newest = self.sensors.moment(('image',))
+        newest = self.sensors.newest('image')
         if self._gripper.received == -math.inf or newest is None:
             return ''
         try:
@@ -183,12 +183,12 @@ class PlannerInputs:
         """Remember what the camera sees behind the robot, between goals too."""
         self._tell(name)
         if name == self._types['image'][1]:
-            newest = self.sensors.moment(('image',))
+            newest = self.sensors.newest('image')
             if newest is not None:
                 self._match_joints(newest.stamp_ns)  # again, if the picture was sent again
         if not self.robot.used or name not in (self._types['image'][1], self._types['mask'][1]):
             return
-        moment = self.sensors.moment(('image', 'mask'))
+        moment = self.sensors.newest('image', 'mask')
         if moment is not None:
             with suppress(TapError):  # look() reports it
                 self._picture(moment.messages)

@@ -99,7 +99,8 @@ class RequestReader:
             found = start.newest('image', 'mask')
             if found is not None:
                 with suppress(TapError):  # a request for this picture is refused with it
-                    self._robot.see(found['image'], found['mask'], start.jumps)
+                    self._robot.see(
+                        found.messages['image'], found.messages['mask'], start.jumps)
 
     def read(self, request: PredictSubgoal.Request, predictor: Predictor) -> PendingRequest:
         """
@@ -158,17 +159,18 @@ class RequestReader:
                 '(the simulator does at sim/reset), or send it along')
         needed, must = ['image'], name == 'start'
         for topic in ['mask'] * self._robot.used + ['objects']:
-            if topic not in found and (topic == 'mask' and must or not newest.missing([topic])):
-                stamp = to_nanoseconds(found['image'].header.stamp)
-                found = newest.wait((*needed, topic), OBJECTS_TIMEOUT, stamp - 1) or found
-            if topic in found:
+            if topic not in found.messages and (
+                    topic == 'mask' and must or not newest.missing([topic])):
+                found = newest.wait(
+                    (*needed, topic), OBJECTS_TIMEOUT, found.stamp_ns - 1) or found
+            if topic in found.messages:
                 needed.append(topic)
-        if self._robot.used and must and 'mask' not in found:
+        if self._robot.used and must and 'mask' not in found.messages:
             raise ImageError(
                 'start: no robot mask with the stamp of the picture, '
-                f'{to_nanoseconds(found["image"].header.stamp) / 1e9:.9f} s, has come on '
+                f'{found.stamp_ns / 1e9:.9f} s, has come on '
                 f'{newest.names(["mask"])}; publish it, or start the node with robot_mask none')
-        return found
+        return found.messages
 
     def _picture(self, name: str, found: Mapping[str, Any]) -> np.ndarray:
         """Return the picture of what was found, without the robot if there is a mask."""
@@ -187,10 +189,10 @@ class RequestReader:
             return f'the list on {topic} is empty'
         if newest is None:
             return f'nothing has come on {observations.names(["objects"], explained=True)}'
-        stamps = [f'{to_nanoseconds(message.header.stamp) / 1e9:.9f} s'
-                  for message in (newest['objects'], found['image'])]
-        return (f'the newest on {topic} has the stamp {stamps[0]}, the picture on '
-                f'{observations.names(["image"])} {stamps[1]}; publish both with the same')
+        return (f'the newest on {topic} has the stamp {newest.stamp_ns / 1e9:.9f} s, the picture '
+                f'on {observations.names(["image"])} '
+                f'{to_nanoseconds(found["image"].header.stamp) / 1e9:.9f} s; publish both with '
+                'the same')
 
 
 def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],

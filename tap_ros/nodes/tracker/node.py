@@ -198,7 +198,7 @@ class TrackerNode(Node):
 
         :raises TapError: without a goal picture, and where nothing differs.
         """
-        goal = self._goals.moment(('image',))
+        goal = self._goals.newest('image')
         if goal is None or is_empty(goal.messages['image']):
             raise TrackingError(
                 f'nothing has come on {self._goals.names(["image"], explained=True)}; without a '
@@ -224,7 +224,7 @@ class TrackerNode(Node):
 
     def _newest(self) -> tuple[Moment, View]:
         """Return the newest picture; TrackingError where there is none of this scene."""
-        moment = self._sensors.moment(self._topics)
+        moment = self._sensors.newest(*self._topics)
         begun_ns, jumps = self._begun
         if moment is None:
             missing = self._sensors.missing(self._topics)
@@ -305,7 +305,7 @@ class TrackerNode(Node):
         if changed:
             self._forget(changed)
             return
-        moment = self._sensors.moment(self._topics)
+        moment = self._sensors.newest(*self._topics)
         if moment is None or moment.stamp_ns < selection.stamp_ns:
             return
         if moment.stamp_ns == selection.stamp_ns:
@@ -330,7 +330,7 @@ class TrackerNode(Node):
 
     def _look_at_goal(self, selection: Selection) -> None:
         """Find the objects in the goal picture, if that is another one."""
-        goal = self._goals.moment(('image',))
+        goal = self._goals.newest('image')
         if goal is None or goal.stamp_ns == selection.goal_ns:
             return
         masked = self.params['robot_mask'] != 'none' and 'mask' not in goal.messages
