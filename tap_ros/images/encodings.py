@@ -6,12 +6,11 @@ Encodings of cameras to rgb: those of sensor_msgs/Image, and files in sensor_msg
 A new encoding is a row of ENCODINGS; recordings and nodes read it then.
 """
 
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 import io
 import re
 import struct
+from typing import NamedTuple
 
 import numpy as np
 from tap_ros.contract import MAX_PICTURE_BYTES
@@ -19,61 +18,37 @@ from tap_ros.errors import ImageError
 from tap_ros.text import escaped
 
 
-@dataclass(frozen=True)
-class Encoding:
+class Encoding(NamedTuple):
     """
     How the pixels of an encoding become rgb.
 
+    :param code: of cv2.cvtColor, without COLOR_; '': they are rgb.
     :param pixel_bytes: bytes of a pixel.
-    :param to_rgb: takes uint8 (H * planes, W, pixel_bytes), contiguous; returns uint8 (H, W, 3).
     :param block: (height, width) in pixels; a picture has whole blocks.
     :param least: pixels that a side has at least.
     :param planes: rows of data for each row of pixels, as colours may stand behind the greys.
     """
 
-    pixel_bytes: int
-    to_rgb: Callable[[np.ndarray], np.ndarray]
+    code: str
+    pixel_bytes: int = 3
     block: tuple[int, int] = (1, 1)
     least: int = 1
     planes: float = 1
 
 
-def _channels(size: int, *order: int) -> Encoding:
-    """Return an encoding whose bytes number `order` of `size` are red, green and blue."""
-    def to_rgb(pixels: np.ndarray) -> np.ndarray:
-        return pixels if order == tuple(range(size)) else pixels[..., list(order)]
-    return Encoding(size, to_rgb)
-
-
-def _yuv(code: str) -> Encoding:
-    """Return an encoding whose pixels share their colour by two or four, by its code in cv2."""
-    def to_rgb(pixels: np.ndarray) -> np.ndarray:
-        import cv2  # here, as --help of training does without
-        return cv2.cvtColor(pixels, getattr(cv2, f'COLOR_YUV2RGB_{code}'))
-    if code in ('UYVY', 'YUY2'):
-        return Encoding(2, to_rgb, (1, 2))
-    return Encoding(1, to_rgb, (2, 2), planes=1.5)
-
-
-def _bayer(code: str) -> Encoding:
-    """Return a mosaic; cv2 calls it by the second and third pixel of the second row."""
-    def to_rgb(pixels: np.ndarray) -> np.ndarray:
-        import cv2  # as above
-        return cv2.demosaicing(pixels[..., 0], getattr(cv2, f'COLOR_Bayer{code}2RGB'))
-    return Encoding(1, to_rgb, (2, 2), 4)
-
-
+_GREY, _UYVY, _YUYV = Encoding('GRAY2RGB', 1), *(
+    Encoding(f'YUV2RGB_{code}', 2, (1, 2)) for code in ('UYVY', 'YUY2'))
 ENCODINGS = {
-    'rgb8': _channels(3, 0, 1, 2), 'bgr8': _channels(3, 2, 1, 0),
-    'rgba8': _channels(4, 0, 1, 2), 'bgra8': _channels(4, 2, 1, 0),
-    'mono8': _channels(1, 0, 0, 0),
+    'rgb8': Encoding(''), 'bgr8': Encoding('BGR2RGB'), 'rgba8': Encoding('RGBA2RGB', 4),
+    'bgra8': Encoding('BGRA2RGB', 4), 'mono8': _GREY,
     # What cv_bridge calls pictures of OpenCV, whose order is blue, green, red.
-    '8UC1': _channels(1, 0, 0, 0), '8UC3': _channels(3, 2, 1, 0), '8UC4': _channels(4, 2, 1, 0),
-    'yuv422': _yuv('UYVY'), 'uyvy': _yuv('UYVY'),
-    'yuv422_yuy2': _yuv('YUY2'), 'yuyv': _yuv('YUY2'),
-    'nv12': _yuv('NV12'), 'nv21': _yuv('NV21'), 'i420': _yuv('I420'),
-    'bayer_rggb8': _bayer('BG'), 'bayer_bggr8': _bayer('RG'), 'bayer_gbrg8': _bayer('GR'),
-    'bayer_grbg8': _bayer('GB')}
+    '8UC1': _GREY, '8UC3': Encoding('BGR2RGB'), '8UC4': Encoding('BGRA2RGB', 4),
+    'yuv422': _UYVY, 'uyvy': _UYVY, 'yuv422_yuy2': _YUYV, 'yuyv': _YUYV,
+    **{name: Encoding(f'YUV2RGB_{name.upper()}', 1, (2, 2), planes=1.5)
+       for name in ('nv12', 'nv21', 'i420')},
+    # cv2 calls a mosaic by the second and third pixel of its second row.
+    **{f'bayer_{name}8': Encoding(f'Bayer{code}2RGB', 1, (2, 2), 4) for name, code in (
+        ('rggb', 'BG'), ('bggr', 'RG'), ('gbrg', 'GR'), ('grbg', 'GB'))}}
 _DEEP = re.compile(r'(mono|rgb|bgr|rgba|bgra|bayer_[rgb]{4})16|(16|32|64)[US FC]+\d*')
 _COMPRESSED = ('JPEG', 'PNG', 'WEBP', 'AVIF', 'JPEG2000')
 _MARKER = re.compile(rb'\xff[^\0\xff\xd0-\xd7]')  # what ends the data of a JPEG's scan
@@ -109,7 +84,11 @@ def to_rgb(pixels: np.ndarray, name: str) -> np.ndarray:
             or min(height, width) < encoding.least):
         raise ImageError(f'{width}x{height} pixels of encoding {name}; it comes in blocks of '
                          'two')
-    return np.ascontiguousarray(encoding.to_rgb(np.ascontiguousarray(pixels)))
+    pixels = np.ascontiguousarray(pixels)
+    if not encoding.code:
+        return pixels
+    import cv2  # here, as --help of training does without
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f'COLOR_{encoding.code}')))
 
 
 def decompress(data: bytes | memoryview | np.ndarray, description: str,
