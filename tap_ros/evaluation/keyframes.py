@@ -1,15 +1,22 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Keyframes of a demonstration that need no training, or a few marks only.
+Keyframes that need no training, or a few marks only; and how often one, or a prediction, is right.
 
 Each takes pictures, uint8 (T, H, W, 3) from start to goal, and returns a frame between them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from tap_ros.prediction.preference import describe, learn_preference
+from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
+from tap_ros.prediction.marks import chance, features_of
+from tap_ros.prediction.nearest_keyframe import halfway, l1_distance
+from tap_ros.prediction.preference import describe, learn_preference, Preference, SIZE
+from tap_ros.recording.cache import EpisodeStore
+from tap_ros.recording.marks import Mark, Marks
+from tap_ros.training.robot_mask import trained_robot_mask
 
 ASIDE = 0.1  # share of the way in pictures that slowest stays away from start and goal
 SMOOTH = np.ones(3) / 3
@@ -67,3 +74,75 @@ def _distances(frames: np.ndarray, end: int) -> np.ndarray:
     """Return the l1 distances (T,) to the frame at an end, in pixel values."""
     pictures = frames.astype(np.float32)
     return np.asarray(np.abs(pictures - pictures[end]).mean((1, 2, 3)))
+
+
+def score_hits(store: EpisodeStore, marks: Marks, episodes: np.ndarray, others: np.ndarray,
+               matched: np.ndarray, training: Mapping[str, Any]) -> dict[str, list[Interval]]:
+    """
+    Say in which share of the marked episodes a frame is a marked one, or at most one beside it.
+
+    :param marks: of at least one of the episodes; of several in an episode any counts.
+    :param episodes: (N,) indices of episodes.
+    :param others: of demonstrations to be compared with, as a rule those trained on.
+    :param matched: (N,), the frames that the predictions match.
+    :param training: of the weights; tells the preference, where one was learned.
+    :return: of the prediction, the preference alone (its largest w between start and goal), the
+        nearest demonstration (see nearest_frame), keyframes and a random frame: the shares of
+        hits and of near ones.
+    """
+    rows = [row for row, i in enumerate(episodes) if int(i) in marks.episodes]
+    scored = [int(episodes[row]) for row in rows]
+    frames = {'prediction': [int(matched[row]) for row in rows]}
+    for one in (training.get('marks') or {}).get('preferences', [])[:1]:
+        if len(one['weights']) != SIZE:  # of an earlier version, of other features
+            continue
+        preference, robot_mask = Preference.from_json(one), trained_robot_mask(training)[0]
+        frames['preference alone'] = [
+            preference.best(features_of(store, i, robot_mask)) for i in scored]
+    if set(others.tolist()) - set(scored[:1]):
+        frames['nearest demonstration'] = [
+            nearest_frame(store, i, others.tolist(), marks) for i in scored]
+    keyframes: dict[str, Callable[[np.ndarray], int]] = {
+        'slowest': slowest, 'middle': middle, 'UVD-like': uvd}
+    for name, choose in keyframes.items():
+        frames[name] = [choose(store.frames(i)) for i in scored]
+    windows = [marks.episodes[i] for i in scored]
+    result = {name: [share_interval([
+        is_hit(window, frame, off) for frame, window in zip(each, windows)]) for off in (0, 1)]
+        for name, each in frames.items()}
+    result['random'] = [mean_interval([
+        min(1.0, sum(chance(mark, int(store.lengths[i]), off) for mark in window))
+        for i, window in zip(scored, windows)]) for off in (0, 1)]
+    return result
+
+
+def is_hit(window: Sequence[Mark], frame: int, off: int = 0) -> bool:
+    """Say whether a frame is within one of the marks of its episode, or so many beside it."""
+    return any(first - off <= frame <= last + off for first, last in window)
+
+
+def nearest_frame(store: EpisodeStore, i: int, others: Sequence[int], marks: Marks) -> int:
+    """
+    Return the frame of an episode that is nearest to the keyframe of another demonstration.
+
+    :param others: the one whose start and goal pictures are nearest is taken: of those with
+        marks, and its keyframe is its last mark; where none has, of all, and its keyframe is the
+        one half way, as nearest_keyframe shows it. The episode itself does not count.
+    """
+    others = [j for j in others if j != i]
+    marked = [j for j in others if j in marks.episodes]
+    frames = store.frames(i)
+    like = min(marked or others, key=lambda j: l1_distance(
+        store.frames(j)[[0, -1]], frames[[0, -1]]))
+    shown = store.frames(like)
+    at = sum(marks.episodes[like][-1]) // 2 if marked else halfway(shown, len(shown) - 1)
+    return min(range(1, len(frames) - 1), key=lambda t: l1_distance(frames[t], shown[at]))
+
+
+def print_hits(hits: Mapping[str, Sequence[Interval]], count: int) -> None:
+    """Print the table of score_hits."""
+    print(f'the matched frame is a marked one, or within one frame of it, in {count} marked '
+          'episodes:')
+    for name, intervals in hits.items():
+        print(f'{name:22s}' + ''.join(
+            f'{f"{one.value:.0%} ({one.low:.0%}, {one.high:.0%})":>20s}' for one in intervals))

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.command import Prediction
-from tap_ros.evaluation.hits import print_hits, score_hits
 from tap_ros.evaluation.intervals import Interval, mean_interval
+from tap_ros.evaluation.keyframes import print_hits, score_hits
 from tap_ros.evaluation.prediction import EpisodeScores, evaluate, verdict
 from tap_ros.evaluation.samples import SampleScores, score_samples
 from tap_ros.evaluation.strips import write_strips

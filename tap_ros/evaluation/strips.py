@@ -8,8 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from tap_ros.evaluation.bottleneck import context_pixels
-from tap_ros.evaluation.hits import is_hit
-from tap_ros.evaluation.keyframes import SMOOTH
+from tap_ros.evaluation.keyframes import is_hit, SMOOTH
 from tap_ros.evaluation.prediction import ask, is_forward
 from tap_ros.files import write_atomically
 from tap_ros.images.drawing import enlarge, GAP, grid, overlay, png_bytes

@@ -19,8 +19,8 @@ from jinja2 import Environment
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.choose import Options
-from tap_ros.evaluation.hits import is_hit
 from tap_ros.evaluation.intervals import share_interval
+from tap_ros.evaluation.keyframes import is_hit
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.strips import draw_strips
 from tap_ros.files import write_atomically

@@ -16,8 +16,8 @@ from tap_ros.evaluation.bottleneck import (
     bottleneck_scores,
     bottleneck_share,
 )
-from tap_ros.evaluation.hits import nearest_frame
 from tap_ros.evaluation.intervals import bootstrap
+from tap_ros.evaluation.keyframes import nearest_frame
 from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
