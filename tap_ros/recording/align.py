@@ -10,7 +10,6 @@ enclose its stamp, and that is nearest in the log.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
 import warnings
 
 import numpy as np
@@ -22,7 +21,7 @@ from tap_ros.recording.damage import FAR, seconds
 from tap_ros.recording.episode import EpisodeTable, RecordingWarning
 from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
-from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, Span, WALL_NS
+from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, Span
 from tap_ros.robots.arm import get_arm
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
@@ -36,25 +35,12 @@ def runs_of(parts: Iterable[Columns]) -> list[list[Columns]]:
         logs = {name: part.arrays[name][:, 0] for name in NAMES if len(part.arrays.get(name, ()))}
         oldest = min((int(log.min()) for log in logs.values()), default=FAR)
         first = int(logs['frame'].min()) if 'frame' in logs else FAR
-        back = oldest < newest - MAX_JITTER_NS or first < shown - MIN_MATCH_NS
-        if not runs or back and not (newest > WALL_NS and _is_next(runs[-1][-1], part)):
+        if not runs or oldest < newest - MAX_JITTER_NS or first < shown - MIN_MATCH_NS:
             runs.append([])
         runs[-1].append(part)
         newest = max((int(log.max()) for log in logs.values()), default=-FAR)
         shown = int(logs['frame'].max()) if 'frame' in logs else -FAR
     return runs
-
-
-def _is_next(before: Columns, part: Columns) -> bool:
-    """Tell whether a recorder that split its bag wrote one file after another, in an episode."""
-    marks = part.arrays.get('mark', np.empty((0, 4), np.int64))
-    frames = part.arrays.get('frame', np.empty((0, 4), np.int64))
-    if len(marks) and marks[0, 3] == 0 and (not len(frames) or marks[0, 2] < frames[0, 2]):
-        return False
-    (stem, number), (next_stem, next_number) = (
-        Path(one.source).name.split('.')[0].rpartition('_')[::2] for one in (before, part))
-    return (stem == next_stem and number.isdecimal() and next_number.isdecimal()
-            and int(next_number) == int(number) + 1)
 
 
 def assemble(parts: Sequence[Columns], arm: ArmMount,

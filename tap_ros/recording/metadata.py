@@ -129,8 +129,6 @@ def bag_files(folder: str | Path) -> list[Path]:
         storage, paths = information['storage_identifier'], information['relative_file_paths']
         if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
             raise ValueError('relative_file_paths is no list of names')
-        if len(set(paths)) < len(paths):
-            raise ValueError('relative_file_paths names a file twice')
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     except _UNUSABLE as error:
@@ -143,21 +141,14 @@ def bag_files(folder: str | Path) -> list[Path]:
             f'{path}: the bag is stored as {escaped(storage, 40)}; mcap and sqlite3 are read; '
             'make one of these with ros2 bag convert where its storage is installed')
     files = [folder / Path(name).name for name in paths]
-    files = [file if _is_file(file) else file.with_suffix('') if file.suffix in PACKED else file
+    files = [file.with_suffix('') if file.suffix in PACKED and not file.is_file() else file
              for file in files]  # some were unpacked since
-    missing = [file.name for file in files if not _is_file(file)]
+    missing = [file.name for file in files if not file.is_file()]
     if missing:
         raise RecordingError(
             f'{path} names files that are not there: {listing(missing)}; bring them back, or '
             'make metadata.yaml anew (ros2 bag reindex)')
     return files
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that is too long
-        return False
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from made_clocks import record, Recording, SECOND, WALL
 import numpy as np
 import pytest
 from tap_ros.recording import clocks
-from tap_ros.recording.align import runs_of
 from tap_ros.recording.columns import join
 from tap_ros.recording.reading import Reading
 
@@ -301,27 +300,6 @@ def test_a_clock_that_is_set_back_in_a_pause_joins_no_demonstrations(pause):
             np.testing.assert_allclose(found.grippers, table.grippers, atol=0.1)
             assert 'back' in told[0], told
             assert len(told) == len({text.split(':')[1] for text in told})  # one a topic
-
-
-@pytest.mark.parametrize('size', [0.25, 1, 10, 3600])
-def test_a_clock_that_is_set_where_a_recorder_splits_its_bag_cuts_nothing(size):
-    for marks in (False, True):
-        good = record(np.random.default_rng(1), 10, 1, marks=marks)
-        numbers, table, _ = good.read()
-        half, bad = good.rows('frame')[23], good.spoilt(lambda *_: None, None)
-        bad.log[half:] -= int(size * SECOND)
-        bad.stamp[half:] -= int(size * SECOND)
-        files = [bad.columns(slice(None, half), 'a/demo_0.mcap'),
-                 bad.columns(slice(half, None), 'a/demo_1.mcap')]
-        (run,) = runs_of(files)
-        for part, first in zip(run, (0, 23)):
-            part.arrays['frame'][:, 3] -= first
-        found, read_table, told = bad.read(*run)
-        assert found == [[*range(23), *range(len(numbers[0]) - 23)]]
-        assert (read_table.actions != table.actions).any(1).sum() <= NEAR
-        assert len(told) == 1 and 'recorder was set back by' in told[0]
-        files[1].source = 'a/other.mcap'
-        assert len(runs_of(files)) == 2
 
 
 def test_bags_are_read_so_with_the_cache_and_a_rate(tmp_path):
