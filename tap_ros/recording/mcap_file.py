@@ -130,6 +130,8 @@ class McapFile:
         for start, record in self._in_order():
             yield self._unpacked(start, record) if isinstance(record, Chunk) else (
                 self._scan([record]))
+        if self._stopped is not None:
+            yield self._scan(list(self._beginning_of_chunk(self._stopped)))
 
     def _find_summary(self) -> Summary:
         """Return what the end of the file says it holds; nothing, where that cannot be used."""
@@ -170,6 +172,24 @@ class McapFile:
                 start = stream.tell()
         self._stopped = start
 
+    def _beginning_of_chunk(self, start: int) -> Iterator[McapRecord]:
+        """Yield the records that are whole in a chunk that the file ends in, at a byte."""
+        with suppress(*_DAMAGE):
+            stream = ReadDataStream(BytesIO(self._data[start:start + 100]))
+            kind = stream.read1()
+            stream.read(3 * 8)  # the length of the record, and the times
+            size, _, name, _ = (stream.read8(), stream.read4(), stream.read_prefixed_string(),
+                                stream.read8())
+            if kind != Opcode.CHUNK or size > MAX_CHUNK_BYTES:
+                return
+            data = self._data[start + stream.count:]
+            if name == 'zstd':
+                data = zstandard.ZstdDecompressor().stream_reader(data).read(size)
+            elif name == 'lz4':
+                import lz4.frame  # comes with mcap; few recordings need it
+                data = lz4.frame.LZ4FrameDecompressor().decompress(data, size)
+            yield from StreamReader(BytesIO(data), skip_magic=True).records
+
     def _unpacked(self, start: int, chunk: Chunk | ChunkIndex) -> list[Found]:
         """Return the messages of a chunk, or of what the summary says of one, at a byte."""
         first, last = (min(time, FAR) for time in (
@@ -184,6 +204,9 @@ class McapFile:
             if chunk.uncompressed_size > MAX_CHUNK_BYTES:
                 raise ValueError(f'it claims to unpack to {chunk.uncompressed_size} bytes; at '
                                  f'most {MAX_CHUNK_BYTES} are accepted')
+            if chunk.compression == 'zstd' and zstandard.frame_content_size(chunk.data) not in (
+                    -1, chunk.uncompressed_size):  # counts more for what unpacks than our limit
+                raise ValueError('it unpacks to more than it claims, or to less')
             return self._scan(breakup_chunk(chunk, validate_crc=True))
         except _DAMAGE as error:
             self.losses.append(Loss(f'it is damaged, restore the file from a copy: {error}',

@@ -191,11 +191,35 @@ def test_other_ways_to_write_mcap(tmp_path, chunked):
         assert not texts, options
 
 
+@pytest.mark.parametrize('compression', CompressionType)
+def test_a_chunk_that_the_file_ends_in_is_read_up_to_there(compression, tmp_path):
+    episodes = [make_episode(i, T=20, size=(64, 64), start=(i + 1) * 10**10) for i in range(2)]
+    with EpisodeWriter(tmp_path / 'a.mcap') as writer:
+        for episode in episodes:
+            writer.write(episode)
+    path = rewrite(writer.path, tmp_path / 'b.mcap', chunk_size=10**9, compression=compression)
+    data = path.read_bytes()
+    end = next(end for kind, _, end in records(data) if kind == CHUNK)
+    for share in (0.95, 0.5):
+        path.write_bytes(data[:int(share * end)])
+        found, texts = read(path)
+        for episode in found:
+            check_part(episode, episodes)
+        assert any('cut off at byte' in text for text in texts)
+        assert sum(map(len, found)) > 40 * (share - 0.3)  # compressed blocks are of 128 kB
+    path.write_bytes(data[:end // 1000])
+    with pytest.raises(RecordingError, match='holds no message.*the file is cut off'):
+        list(open_recordings(path))
+
+
 def test_a_chunk_that_claims_to_hold_what_no_recording_holds_is_refused(tmp_path):
-    packed = zstandard.compress(bytes(100))
-    record = struct.pack('<QQQII', 0, 0, mcap_file.MAX_CHUNK_BYTES + 1, 0, 4) + b'zstd' + (
-        struct.pack('<Q', len(packed)) + packed)
-    (tmp_path / 'a.mcap').write_bytes(
-        b'\x89MCAP0\r\n' + struct.pack('<BQ', CHUNK, len(record)) + record)
-    with pytest.raises(RecordingError, match='a.mcap: .*chunk .*claims to unpack to'):
-        open_recordings(tmp_path)
+    for content, claimed, words in (
+            (100, mcap_file.MAX_CHUNK_BYTES + 1, 'claims to unpack to'),
+            (50 * 2**20, 1000, 'more than it claims')):
+        packed = zstandard.compress(bytes(content))
+        record = struct.pack('<QQQII', 0, 0, claimed, 0, 4) + b'zstd' + (
+            struct.pack('<Q', len(packed)) + packed)
+        (tmp_path / 'a.mcap').write_bytes(
+            b'\x89MCAP0\r\n' + struct.pack('<BQ', CHUNK, len(record)) + record)
+        with pytest.raises(RecordingError, match=f'a.mcap: .*chunk .*{words}'):
+            open_recordings(tmp_path)
