@@ -43,12 +43,11 @@ class ScenePublishers:
     def __init__(self, node: Node, world: World, observer: bool, tracked: bool) -> None:
         self._newest: dict[str, Any] = {}  # topic -> the message sent last
         streams = STREAMS | ({'observer/image_raw': Image} if observer else {})
-        names = {one.name: true.name for one, true in (
-            (topics.OBJECTS, topics.TRUE_OBJECTS),
-            (topics.GOAL_OBJECTS, topics.TRUE_GOAL_OBJECTS))} if tracked else {}
-        self._publishers = {topic: node.create_publisher(kind, names.get(topic, topic), qos)
-                            for kinds, qos in ((streams, STREAM), (GOAL, LATCHED))
-                            for topic, kind in kinds.items()}
+        beside = 'truth/' if tracked else ''
+        self._publishers = {topic: node.create_publisher(
+            kind, f'{beside if kind is ObjectStates else ""}{topic}', qos)
+            for kinds, qos in ((streams, STREAM), (GOAL, LATCHED))
+            for topic, kind in kinds.items()}
         self._observer = observer
         self._pose = node.create_publisher(PoseStamped, topics.CAMERA_POSE.name, LATCHED)
         self._description = node.create_publisher(String, 'robot_description', LATCHED)

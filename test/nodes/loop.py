@@ -13,7 +13,7 @@ import numpy as np
 from processes import Client, Newest, NodeProcess, until
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import Image, JointState
+from sensor_msgs.msg import Image
 from sim_bridge.simulator import Simulator
 from std_msgs.msg import Float64
 from tap_msgs.action import ReachGoal
@@ -44,9 +44,6 @@ class Loop:
         self.reach_client = ActionClient(node, ReachGoal, 'reach_goal')
         self.predictor_alive = Liveness(node, 'predictor_node')
         self.image = Newest(node, Image, 'camera/image_raw', STREAM)
-        self.objects = Newest(node, ObjectStates, 'objects', STREAM)
-        self.joints = Newest(node, JointState, 'joint_states', STREAM)
-        self.goal_image = Newest(node, Image, 'goal/image', LATCHED)
         self.goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
         self.subgoal = Newest(node, Subgoal, 'subgoal', LATCHED)
         self.overlay = Newest(node, Image, 'subgoal/overlay', LATCHED)
@@ -60,15 +57,8 @@ class Loop:
         self.processes[name] = NodeProcess(name, self.folder / f'{name}.log', parameters)
 
     def reset(self, seed=SEED):
-        """Start a scene, and wait for what is published at its start."""
-        self.image.wait(30)  # in lock-step one always comes
-        before = max(to_nanoseconds(topic.wait(30).header.stamp)
-                     for topic in (self.image, self.goal_image))
-        self.client.call('reset', task='push2', seed=seed)
-        # A picture may still come that answers a command; a goal comes with a scene alone.
-        goal = self.goal_image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > before)
-        for topic in (self.image, self.objects, self.joints, self.goal_objects):
-            topic.wait(30, lambda m: m.header.stamp == goal.header.stamp)
+        """Start a scene, and wait until it is seen."""
+        self.client.reset('push2', seed)
         self.twists.clear()
         self.distances.clear()
 

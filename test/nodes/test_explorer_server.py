@@ -18,7 +18,7 @@ from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.explorer.browser_commands import CommandError, parse_command
-from tap_ros.nodes.explorer.goal import GoalByHand
+from tap_ros.nodes.explorer.display import GoalByHand
 from tap_ros.nodes.explorer.node import ExplorerNode
 from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
 from tap_ros.nodes.ros_messages import encode_image, encode_objects

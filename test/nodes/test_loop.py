@@ -13,7 +13,6 @@ from processes import LocalNode, until
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from tap_ros.errors import TapError
-from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.predictor.node import PredictorNode
@@ -50,12 +49,10 @@ def test_all_viewers_show_topics_of_the_nodes_as_they_are_offered(loop):
 
 
 def set_goal(loop, pixels):
-    """Move objects of the goal, {name: (u, v)}; return all its pixels (K, 2) once they came."""
-    before = to_nanoseconds(loop.goal_objects.wait(10).header.stamp)
+    """Move objects of the goal, {name: (u, v)}; return the View of it once it came."""
+    before = loop.client.goal().stamp_ns
     loop.client.set_goal(pixels)
-    for topic in (loop.goal_image, loop.goal_objects):
-        topic.wait(10, lambda m: to_nanoseconds(m.header.stamp) > before)
-    return decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
+    return loop.client.goal(before)
 
 
 def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_it(loop):
@@ -69,10 +66,9 @@ def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_
     assert before.image.data != after.image.data
     count = len(loop.moves())
     # The goal is where the objects are now: nothing is left to do.
-    last = loop.image.wait(10)
-    objects = loop.objects.wait(10, lambda m: m.header.stamp == last.header.stamp)
-    names, pixels = decode_objects(objects, 'objects')
-    np.testing.assert_allclose(set_goal(loop, dict(zip(names, pixels))), pixels, atol=1e-3)
+    here = loop.client.camera()
+    moved = set_goal(loop, dict(zip(here.names, here.pixels)))
+    np.testing.assert_allclose(moved.pixels, here.pixels, atol=1e-3)
     result = loop.reached(mode='direct')
     assert result.success and 'reached' in result.message and result.expected_distance < 0.1
     assert len(loop.moves()) == count
@@ -86,19 +82,18 @@ def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
     loop.reached(mode='direct', step_budget=2)
     # Twice at the last moment of the episode: the later one counts.
     set_goal(loop, {'object_1': (30.0, 44.25)})
-    pixels = set_goal(loop, MOVED)
-    picture = loop.goal_image.wait(1)
+    goal = set_goal(loop, MOVED)
     loop.reset(seed=8)
-    drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
+    drawn = loop.client.goal().pixels
     loop.reached(mode='direct', step_budget=1)  # by then the recorder knows of the new episode
     loop.client.record(False)
     # What the scene before sent last may reach the recorder after the bag was begun.
     episode, = (e for e in open_recordings(folder) if e.seed == 7)
     following, = (e for e in open_recordings(folder) if e.seed == 8)
     assert (len(episode), episode.outcome) == (3, 'failure')
-    np.testing.assert_array_equal(episode.goal_pixels, pixels)
+    np.testing.assert_array_equal(episode.goal_pixels, goal.pixels)
     np.testing.assert_allclose(episode.goal_pixels[1], MOVED['object_1'], atol=1e-4)
-    assert episode.goal_frame.tobytes() == bytes(picture.data)
+    np.testing.assert_array_equal(episode.goal_frame, goal.image)
     assert episode.goal_mask is not None
     np.testing.assert_array_equal(following.goal_pixels, drawn)
 

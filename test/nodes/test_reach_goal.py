@@ -16,7 +16,6 @@ import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from tap_ros.messages.images import decode_image
-from tap_ros.messages.objects import decode_objects
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.planner.plan_view import CHOSEN
 from tap_ros.nodes.topics import LATCHED, STREAM
@@ -67,10 +66,8 @@ def test_the_nodes_go_by_subgoals_as_one_process_does_and_tell_what_they_do(loop
     assert [each.step for each in told] == [1, 2, 3, 4]
     assert all(each.planning_ms > 0 for each in told)
     assert loop.stopped() and until(lambda: len(loop.distances) > 4)
-    last, (_, goals) = loop.image.wait(10), decode_objects(loop.goal_objects.wait(1), 'goal')
-    _, pixels = decode_objects(
-        loop.objects.wait(10, lambda m: m.header.stamp == last.header.stamp), 'objects')
-    away = np.linalg.norm(pixels - goals, axis=1).mean()
+    here, goal = loop.client.camera(), loop.client.goal()
+    away = np.linalg.norm(here.pixels - goal.pixels, axis=1).mean()
     assert loop.distances[-1] == result.expected_distance == pytest.approx(away, abs=1e-3)
     shown = decode_image(overlay.wait(10), 'plan/overlay', (384, 384))
     assert (shown == CHOSEN).all(-1).sum() > 30

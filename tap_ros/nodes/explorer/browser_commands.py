@@ -14,7 +14,7 @@ from tap_ros.errors import TapError
 from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
 from tap_ros.nodes.calls import CallError, Reaching
 from tap_ros.nodes.client import Client
-from tap_ros.nodes.explorer.goal import simulated
+from tap_ros.nodes.explorer.display import simulated
 from tap_ros.nodes.services import reason
 from tap_ros.text import escaped, listing
 from tap_ros.weights import PREDICTORS

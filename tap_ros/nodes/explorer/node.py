@@ -21,7 +21,6 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.explorer import display
 from tap_ros.nodes.explorer.browser_commands import ExplorerCalls
-from tap_ros.nodes.explorer.goal import GoalByHand
 from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
@@ -64,7 +63,7 @@ class ExplorerNode(Node):
         self._problem: dict[str, Any] = {'count': 0, 'text': ''}
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
         self._selections = 0  # answers of select_objects
-        self.goal = GoalByHand(self)
+        self.goal = display.GoalByHand(self)
         self._calls = ExplorerCalls(self)
         self._server = ExplorerServer(
             self._calls.do, self.params['host'], self.params['port'], self.params['token'])
