@@ -157,10 +157,8 @@ def errors(scores):
 
 def relative(rows):
     """Compare the error with that of copying, see against_copying; a row a seed or an episode."""
-    error, copying = (np.mean([row[name] for row in rows], axis=0) if isinstance(
-        rows[0][name], list) else np.array([row[name] for row in rows])
-        for name in ('error', 'copying'))
-    return against_copying(error, copying)
+    found = [np.array([row[name] for row in rows]) for name in ('error', 'copying')]
+    return against_copying(*(each.mean(0) if each.ndim == 2 else each for each in found))
 
 
 def page(found):

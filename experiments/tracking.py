@@ -111,27 +111,26 @@ def pooled(rows, metric):
     return share((value, low, high))
 
 
-def of(rows, look, size, click, tracker):
+def of(rows, column):
     """Return the rows of a column."""
+    look, size, click, tracker = COLUMNS[column]
     return rows[rows.recording.str.contains(f'_{look}_') & (rows['size'] == size)
                 & (rows.click_px == click) & (rows.tracker == tracker)]
 
 
 def table(rows):
-    """Return a table of metrics by column."""
-    return pd.DataFrame([{'': line} | {
-        name: pooled(of(rows, *column) if metric != 'cpu_ms' else of(rows, *column)[
-            ~of(rows, *column).recording.str.startswith('push3')], metric)
-        for name, column in COLUMNS.items()} for metric, line in LINES.items()])
+    """Return a table of metrics by column; times are of two objects."""
+    two = rows[(rows.metric != 'cpu_ms') | ~rows.recording.str.startswith('push3')]
+    return pd.DataFrame([{'': line} | {name: pooled(of(two, name), metric) for name in COLUMNS}
+                         for metric, line in LINES.items()])
 
 
 def by_task(rows):
     """Return a table of the UR10e's tasks."""
-    some = {key: LINES[key] for key in ('median_px', 'within_2px', 'wrong_sure', 'goal_right')}
-    mine = of(rows, *COLUMNS['UR10e, exact'])
-    return pd.DataFrame([{'task': task} | {line: pooled(
-        mine[mine.recording.str.startswith(task)], metric) for metric, line in some.items()}
-        for task in TASKS])
+    mine = of(rows, 'UR10e, exact')
+    return pd.DataFrame([{'task': task} | {LINES[metric]: pooled(
+        mine[mine.recording.str.startswith(task)], metric) for metric in (
+            'median_px', 'within_2px', 'wrong_sure', 'goal_right')} for task in TASKS])
 
 
 def confidence(rows):

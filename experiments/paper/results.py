@@ -62,12 +62,11 @@ def on_same_episodes(runs):
     return kept, [run for run in runs if run not in kept]
 
 
-def write_results(places, pictures=True):
+def write_results(places):
     """
     Write prediction.csv, the plot of timing, and a picture where weights are at hand.
 
     :param places: sweep.Places.
-    :param pictures: whether to make the picture of predictions again.
     :return: rows of prediction.csv.
     :raises ConfigError: if there are no finished runs, or one cannot be read.
     """
@@ -84,6 +83,5 @@ def write_results(places, pictures=True):
     png = figures.timing(rows)
     if png is not None:
         write_atomically(folder / 'timing.png', png)
-    if pictures:
-        write_picture(places, kept)
+    write_picture(places, kept)
     return rows

@@ -73,7 +73,10 @@ def sweep(runs, places, engine=LOCAL):
     """
     waiting = [run for run in runs if find_result(run, places) is None]
     for name in dict.fromkeys(name for run in waiting for name in (run.task, *run.shifted)):
-        record(name, places, engine)
+        folder = places.recording(name)
+        # One that `collect` did not make stays as it is.
+        if not folder.exists() or (folder / SETTINGS_FILE).exists():
+            collect(folder, RECORDINGS[name].collection, engine)
     tasks, failed = [Work(run.name, perform, (run, places)) for run in waiting], {}
     with tqdm(total=len(tasks), desc='paper', unit='run') as bar:
         for task, get in run_tasks(tasks, engine):
@@ -84,13 +87,6 @@ def sweep(runs, places, engine=LOCAL):
                 bar.write(f'{task.name} failed: {error}')
             bar.update()
     return failed
-
-
-def record(name, places, engine):
-    """Collect a recording, or what it lacks; one that `collect` did not make stays as it is."""
-    folder = places.recording(name)
-    if not folder.exists() or (folder / SETTINGS_FILE).exists():
-        collect(folder, RECORDINGS[name].collection, engine)
 
 
 def perform(run, places):

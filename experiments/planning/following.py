@@ -17,6 +17,7 @@ from tap_ros.training.robot_mask import nearest_free
 CAMERA_SIZE = 256  # px, what objects are followed in
 CLICK_ERROR = 1.35  # px of 64, mean distance of a click from the middle of an object
 CLICKS = 5  # at most
+_camera = lru_cache(Simulator)  # takes the pictures that objects are followed in
 
 
 class Follower:
@@ -89,9 +90,3 @@ class Follower:
 
 def _view(picture):
     return View(picture.image, picture.robot_mask, picture.gripper)
-
-
-@lru_cache
-def _camera(task, size, look):
-    """Return a Simulator that takes the pictures that objects are followed in."""
-    return Simulator(task, size, look)

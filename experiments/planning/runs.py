@@ -20,7 +20,7 @@ from sim_bridge.tasks.tasks import get_task
 from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.engines import LOCAL, run_tasks, Work
-from tap_ros.errors import ConfigError, PlanningError
+from tap_ros.errors import ConfigError, ImageError, PlanningError
 from tap_ros.files import write_atomically
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import VisualMPCConfig
@@ -33,6 +33,9 @@ import torch
 from tqdm import tqdm
 
 SPEED_ONLY = ('batch_size', 'threads')  # settings of the planner that change no result
+DIGITS = 16  # of the SHA-256 of what a weights file holds
+_digest, _simulator = lru_cache(stored_digest), lru_cache(Simulator)
+_predictor, _learned = lru_cache(SubgoalPredictor.load), lru_cache(LearnedForwardModel.load)
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class Job:
         settings = {
             'task': self.task, 'look': self.look, 'method': self.method.name,
             'device': self.device,
-            'predictor_weights': digest(self.predictor) if self.predictor else None}
+            'predictor_weights': _digest(self.predictor)[:DIGITS] if self.predictor else None}
         if self.stacks:
             return settings | {'object_places': 'ground_truth'}
         planner = asdict(self.method.planner(self.planner))
@@ -88,17 +91,7 @@ class Job:
             'object_pixels': self.method.tracking,
             'planner': {k: v for k, v in planner.items() if k not in SPEED_ONLY},
             'preset': self.preset, 'precision': str(precision),
-            'forward_weights': digest(self.forward_weights)}))
-
-
-@lru_cache
-def digest(path):
-    """
-    Return the first digits of the SHA-256 of what a weights file holds.
-
-    :raises WeightsError: when it cannot be read, or is damaged.
-    """
-    return stored_digest(path)[:16]
+            'forward_weights': _digest(self.forward_weights)[:DIGITS]}))
 
 
 class ResultFile:
@@ -210,7 +203,7 @@ def run_scene(job, seed):
     begin = time.perf_counter()
     try:
         run = make_episode(job, seed)
-    except PlanningError as error:
+    except (ImageError, PlanningError) as error:
         raise PlanningError(f'{job.task}, {job.method.name}, scene {seed}: {error}') from error
     centimetres = 100 * (run.distances if job.stacks else run.distances[-1])
     scene = {'seed': int(seed), 'final_cm': round(float(centimetres.mean()), 3),
@@ -233,7 +226,7 @@ def run_scene(job, seed):
 def make_episode(job, seed):
     """Run a job on one scene; return the PlannedEpisode or StackedEpisode."""
     torch.set_num_threads(1)  # with more, the predictor's last digits differ
-    simulator = _simulator(job.task, job.look)
+    simulator = _simulator(job.task, look=job.look)
     predictor = _predictor(job.predictor, job.device) if job.predictor else None
     if job.stacks:
         return stack(simulator, job.method, seed, predictor)
@@ -243,18 +236,3 @@ def make_episode(job, seed):
             job.forward_weights, job.device, simulator)
     mpc = VisualMPC(model, replace(job.method.planner(job.planner), threads=1))
     return run_episode(simulator, mpc, job.method, job.steps(), seed, predictor)
-
-
-@lru_cache
-def _simulator(task, look):
-    return Simulator(task, look=look)
-
-
-@lru_cache
-def _predictor(path, device):
-    return SubgoalPredictor.load(path, device)
-
-
-@lru_cache
-def _learned(path, device):
-    return LearnedForwardModel.load(path, device)

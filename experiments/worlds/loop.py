@@ -51,6 +51,7 @@ PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threa
 REACHED = 2.0  # px, here about cm: within this, the object is at its goal
 STRIPS = 3  # scenes of each task that are drawn
 SCALE = 2  # of pictures that are drawn
+_planner, _predictor = lru_cache(VisualMPC.load), lru_cache(SubgoalPredictor.load)
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ def run_scene(task, method, seed, forward, predictor, runs):
     """Run a method in a scene; return what came of it, None if the scene has no goal."""
     world = _world(task)
     try:
-        pictures = act(world, method, seed, _planner(forward), predictor)
+        pictures = act(world, method, seed, _planner(forward, PLANNER), predictor)
     except SceneError:
         return None
     start = pictures.pop()
@@ -232,16 +233,6 @@ def act(world, method, seed, mpc, predictor):
 @lru_cache
 def _world(task):
     return Judged(make_world(WORLD, task, IMAGE_SIZE))
-
-
-@lru_cache
-def _planner(forward):
-    return VisualMPC.load(forward, PLANNER)
-
-
-@lru_cache
-def _predictor(path):
-    return SubgoalPredictor.load(path, 'cpu')
 
 
 def write_results(runs, out, args):

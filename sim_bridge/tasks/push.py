@@ -80,19 +80,13 @@ class PushTask(Task):
         # Separated starts may leave no room for separated goals: then both are drawn anew.
         goals = None
         while goals is None:
-            starts = self._draw_starts(rng)
-            goals = _draw_goals(rng, starts)
+            starts = rng.uniform(-OBJECT_RANGE, OBJECT_RANGE, (self.num_objects, 2))
+            if apart(starts, self.start_separation):
+                goals = _draw_goals(rng, starts)
         start_poses, goal_poses = with_yaws(rng, starts, goals)
         hand = gripper_beside_one(rng, starts)
         return TaskScene(shapes, start_poses, goal_poses, hand,
                          tuple(nearest_first(hand[:2], starts, goals)))
-
-    def _draw_starts(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw object origins (K, 2) that are far enough apart."""
-        while True:
-            starts = rng.uniform(-OBJECT_RANGE, OBJECT_RANGE, (self.num_objects, 2))
-            if apart(starts, self.start_separation):
-                return starts
 
     def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
         """Return where the gripper touches the object that it has pushed to its goal last."""
@@ -170,10 +164,9 @@ def with_yaws(rng: np.random.Generator, starts: np.ndarray,
     return np.column_stack([starts, yaws]), np.column_stack([goals, goal_yaws])
 
 
-def _draw_goals(rng: np.random.Generator, starts: np.ndarray,
-                attempts: int = 1000) -> np.ndarray | None:
+def _draw_goals(rng: np.random.Generator, starts: np.ndarray) -> np.ndarray | None:
     """Draw a goal at the fixed distance from each start; None when there seems to be no room."""
-    for _ in range(attempts):
+    for _ in range(1000):
         angles = rng.uniform(0, 2 * np.pi, len(starts))
         goals = starts + GOAL_DISTANCE * np.column_stack([np.cos(angles), np.sin(angles)])
         if (np.abs(goals) <= OBJECT_RANGE).all() and apart(goals, GOAL_SEPARATION):

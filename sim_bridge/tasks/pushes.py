@@ -53,14 +53,13 @@ class Moment(NamedTuple):
         return cls(table.state(), table.target, table.object_poses()[:, :3])
 
 
-def push_actions(push: Push, hand: np.ndarray, place: np.ndarray, goal: np.ndarray,
-                 max_steps: int = MAX_PUSH_STEPS) -> np.ndarray:
+def push_actions(push: Push, hand: np.ndarray, place: np.ndarray,
+                 goal: np.ndarray) -> np.ndarray:
     """
     Turn a push into actions: lift, travel, come down, push.
 
     :param hand: (4,) target of the gripper before it; place, goal: (2,) m, of the object.
-    :param max_steps: the rest is left out.
-    :return: (n, 4).
+    :return: (n, 4), of which there are MAX_PUSH_STEPS at most.
     """
     along = np.array([np.cos(push.angle), np.sin(push.angle)])
     aside = np.array([-along[1], along[0]])
@@ -77,7 +76,7 @@ def push_actions(push: Push, hand: np.ndarray, place: np.ndarray, goal: np.ndarr
         path += straight(above, np.append(start, LIFTED), int(np.ceil(travel / push.travel_speed)))
     steps = int(np.ceil(np.linalg.norm(end - start) / push.speed))
     path += [behind, *straight(behind, np.append(end, LOW), steps)]
-    return moves(path[:max_steps + 1])
+    return moves(path[:MAX_PUSH_STEPS + 1])
 
 
 def after_plans(table: Table, moment: Moment,

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from tap_ros.training.inpainted import Episodes
 
 SCORED_STEPS = (1, 5, 10, 15)
+STRIDE = 8  # frames from one window's start to the next
+MOST_WINDOWS = 400
 MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than this by then
 
 
@@ -39,8 +41,8 @@ def held_out_scores(model: LearnedForwardModel, store: 'Episodes',
 
 
 @torch.no_grad()
-def measure_maps(model: LearnedForwardModel, store: 'Episodes', episodes: Iterable[int],
-                 stride: int = 8, max_windows: int = 400) -> dict[int, dict[str, np.ndarray]]:
+def measure_maps(model: LearnedForwardModel, store: 'Episodes',
+                 episodes: Iterable[int]) -> dict[int, dict[str, np.ndarray]]:
     """
     Measure how far the maps' expected pixels end from where recorded objects went.
 
@@ -48,7 +50,6 @@ def measure_maps(model: LearnedForwardModel, store: 'Episodes', episodes: Iterab
     training.
 
     :param store: EpisodeStore; episodes: indices to score.
-    :param stride: frames from one window's start to the next.
     :return: dict from steps t to dicts of arrays (N,) in pixels, for the N objects that moved by
         then: `map_error`, expected pixel against true pixel; `true_simulator`, maps put where the
         objects truly are by then (what projection and the table's cells alone cost); and
@@ -60,9 +61,9 @@ def measure_maps(model: LearnedForwardModel, store: 'Episodes', episodes: Iterab
     device = table.device
     for i in episodes:
         episode = store[int(i)]
-        for start in range(0, len(episode.frames) - horizon, stride):
+        for start in range(0, len(episode.frames) - horizon, STRIDE):
             true = torch.tensor(episode.object_pixels[start:start + horizon + 1], device=device)
-            if not true.shape[1] or not true.isfinite().all() or len(windows) >= max_windows:
+            if not true.shape[1] or not true.isfinite().all() or len(windows) >= MOST_WINDOWS:
                 continue
             gripper, actions = (torch.tensor(values, device=device) for values in (
                 episode.grippers[start:start + 1], episode.actions[None, start:start + horizon]))
@@ -85,15 +86,14 @@ def measure_maps(model: LearnedForwardModel, store: 'Episodes', episodes: Iterab
 
 
 @torch.no_grad()
-def measure_pictures(model: LearnedForwardModel, store: 'Episodes', episodes: np.ndarray,
-                     stride: int = 8) -> dict[int, dict[str, np.ndarray]]:
+def measure_pictures(model: LearnedForwardModel, store: 'Episodes',
+                     episodes: np.ndarray) -> dict[int, dict[str, np.ndarray]]:
     """
     Measure predicted pictures against what was seen, beside copying the picture begun with.
 
     The arm is drawn where the commands lead it. What the model's robot mask hides does not count.
 
     :param episodes: int64, indices to score; those shorter than the longest window are left out.
-    :param stride: frames from one window's start to the next.
     :return: dict from steps t to dicts of arrays (N,), l1 errors on [0, 1], means over the
         windows of each episode: `picture` and `copying` over all pixels; `changed_picture` and
         `changed_copying` over those that changed since the window began, NaN where none did.
@@ -102,7 +102,7 @@ def measure_pictures(model: LearnedForwardModel, store: 'Episodes', episodes: np
     steps = [t for t in SCORED_STEPS if t < lengths.max(initial=0)]
     found: list[np.ndarray] = []  # (steps, 4) of an episode
     for i, length in zip(episodes.tolist(), lengths.tolist()):
-        starts = range(0, length - steps[-1], stride)
+        starts = range(0, length - steps[-1], STRIDE)
         count = len(starts)
         if not count:
             continue

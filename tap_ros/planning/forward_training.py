@@ -77,7 +77,7 @@ def _prepare(this: run.Run) -> run.Course[LearnedForwardModel, Item]:
             name: sample_grid(state.average, episodes, part, config)
             for name, part in parts.items() if len(part)}
 
-    return run.Course(state, batches, step, score, (config.learning_rate,))
+    return run.Course(state, batches, step, score)
 
 
 def model_config(config: ForwardTrainingConfig, store: EpisodeStore,

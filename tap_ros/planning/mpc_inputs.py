@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the planner is given, a scene and a goal: checks that name what is wrong."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.errors import ImageError, PlanningError
+from tap_ros.errors import PlanningError
 from tap_ros.images.pixels import check_image, check_pixels, in_picture
 from tap_ros.planning.cost import distances_to_places
 from tap_ros.planning.table import Table
@@ -36,11 +35,10 @@ def check_scene(scene: Scene, size: Sequence[int]) -> Scene:
 
     :param scene: Scene; size: (height, width) of its picture.
     :return: the same Scene, numbers as float32.
-    :raises PlanningError: for what cannot be planned with.
+    :raises PlanningError: for what cannot be planned with; ImageError: for its picture.
     """
-    with _as_planning_error():
-        check_image(scene.image, 'image', size)
-        pixels = check_pixels(scene.object_pixels, 'object_pixels')
+    check_image(scene.image, 'image', size)
+    pixels = check_pixels(scene.object_pixels, 'object_pixels')
     if not len(pixels):
         raise PlanningError('object_pixels: no objects; give the position of one at least')
     gripper = np.ascontiguousarray(scene.gripper, np.float32)  # torch takes no flipped views
@@ -78,14 +76,13 @@ def tabulate(table: Table, pixels: ArrayLike | None = None,
     :param table: of the forward model.
     :param pixels: (K, 2) as (u, v), in the picture; or
     :param maps: (K, H, W), each of positive mass. Exactly one of the two.
-    :raises PlanningError: for goals that cannot be planned to.
+    :raises PlanningError: for goals that cannot be planned to, also ImageError.
     """
     if (maps is None) == (pixels is None):
         raise PlanningError('goal: give exactly one of pixels and maps')
     cells, (height, width) = table.pixels().flatten(0, 1), table.image_size
     if maps is None:
-        with _as_planning_error():
-            goals = check_pixels(pixels, 'goal_pixels')
+        goals = check_pixels(pixels, 'goal_pixels')
         outside = goals[~in_picture(goals, table.image_size)].tolist()
         if outside:
             raise PlanningError(f'goal_pixels: {outside} outside the {width}x{height} picture')
@@ -101,12 +98,3 @@ def tabulate(table: Table, pixels: ArrayLike | None = None,
                                 f'sum for each object, got sums {mass.tolist()}')
         distances = distances_to_places(torch.from_numpy(goals).to(cells.device), cells)
     return Goal(distances, table.points()[distances.argmin(1)].cpu().numpy())
-
-
-@contextmanager
-def _as_planning_error() -> Iterator[None]:
-    """Raise what is wrong with a picture as a PlanningError."""
-    try:
-        yield
-    except ImageError as error:
-        raise PlanningError(str(error)) from error

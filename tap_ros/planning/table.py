@@ -96,13 +96,11 @@ def pixel_points(size: Sequence[int]) -> torch.Tensor:
     return torch.stack(torch.meshgrid(*lines, indexing='xy'), dim=-1).float()
 
 
-def sample_picture(images: torch.Tensor, pixels: torch.Tensor,
-                   padding: str = 'border') -> torch.Tensor:
+def sample_picture(images: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     """Read pictures (B, C, H, W) at pixels (B, h, w, 2), (u, v), bilinearly: (B, C, h, w)."""
     height, width = images.shape[-2:]
     scale = pixels.new_tensor([2 / (width - 1), 2 / (height - 1)])
-    return F.grid_sample(
-        images, pixels * scale - 1, padding_mode=padding, align_corners=True)
+    return F.grid_sample(images, pixels * scale - 1, padding_mode='border', align_corners=True)
 
 
 def sample(fields: torch.Tensor, points: torch.Tensor, padding: str = 'border') -> torch.Tensor:
@@ -122,7 +120,7 @@ def mirror_table(homography: torch.Tensor, width: int) -> torch.Tensor:
     return flip_u @ homography @ flip_x
 
 
-def fit_projection(points: np.ndarray, pixels: np.ndarray, iterations: int = 30) -> np.ndarray:
+def fit_projection(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """
     Fit a projection to matching points: linear start, then robust Gauss-Newton (Huber, 1 px).
 
@@ -135,7 +133,7 @@ def fit_projection(points: np.ndarray, pixels: np.ndarray, iterations: int = 30)
     matrix = np.zeros((3, dims + 1))
     matrix[:2] = np.linalg.lstsq(homogeneous, pixels, rcond=None)[0].T
     matrix[2, -1] = 1
-    for _ in range(iterations):
+    for _ in range(30):
         rays = homogeneous @ matrix.T
         error = pixels - rays[:, :2] / rays[:, 2:]  # (N, 2)
         weight = np.minimum(1, 1 / np.maximum(np.linalg.norm(error, axis=1), 1e-9))

@@ -80,20 +80,13 @@ class Batch:
 @dataclass(frozen=True)
 class Sampling:
     """
-    What is taken from an episode.
+    What is taken from an episode; what is not told here, see training_config.DataSettings.
 
-    :param margin: frames left out of the targets next to each context picture.
-    :param num_targets: at most so many targets, drawn at random without repetition; 0: all.
-    :param min_crop: cut episodes to a random piece of at least this share; 1: never.
-    :param start_crop: leave out a random beginning of at most this share; 0: never.
-    :param goal_picture: 'last', 'recorded' or 'mixed', see uses_recorded_goal.
     :param forward: whether the start picture is all of the context.
     :param fraction: take only the frame at this share of the episode, 0 to 1, as fixed-time
         prediction does; None: all.
     :param num_others: with a fraction, so many random other targets after that one.
     :param video_frames: length of Batch.video; 0: none.
-    :param fill_context: with a robot mask, the share of the episodes whose context pictures are
-        filled, too.
     """
 
     margin: int = 0

@@ -255,34 +255,25 @@ class PredictorNetwork(nn.Module):
         :return: a Prediction.
         """
         B, C, _, H, W = context.shape
-        levels = self._encode(context.flatten(0, 1))
+        x, levels = context.flatten(0, 1), []                   # B*C, 3, 64, 64
+        for layer in self.encoder:
+            x = layer(x)
+            if isinstance(layer, nn.LeakyReLU):                 # a block, fine to coarse
+                levels.append(x)
         features = levels[-1].unflatten(0, (B, C))              # B, C, 256, 4, 4
         code = self.head(features.flatten(1, 2))                # B, 128, 1, 1
         if self.config.latent_size:
             if z is None:
                 z = code.new_zeros(B, self.config.latent_size)
             code = torch.cat([code, z[:, :, None, None].to(code.dtype)], 1)
-        flow, masks, new = self._decode(code, levels, context)
+        if self.config.decoder == 'shared':
+            flow, masks, new = self.shared_decoder(code, levels, context)
+        else:
+            flow, masks, new = (code if part is None else part(code) for part in (
+                self.flow_decoder, self.mask_decoder, self.pixel_decoder))
         # Positions need more digits than half precision has: blend in float32.
         flow = flow.float().unflatten(1, (C, 2)) * self.config.flow_scale
         masks = functional.softmax(masks.float(), 1)[:, :, None]
         new_pixels = torch.tanh(new.float()) if self.config.new_pixels else None
         image = combine(warp(context.float(), flow), masks, new_pixels)
         return Prediction(image, flow, masks, new_pixels)
-
-    def _encode(self, pictures: torch.Tensor) -> list[torch.Tensor]:
-        """Return what the encoder's blocks find, fine to coarse; without skips, the last alone."""
-        x, levels = pictures, []                                # B*C, 3, 64, 64
-        for layer in self.encoder:
-            x = layer(x)
-            if isinstance(layer, nn.LeakyReLU):                 # the end of a block
-                levels.append(x)
-        return levels if self.config.skips else levels[-1:]
-
-    def _decode(self, code: torch.Tensor, levels: Sequence[torch.Tensor],
-                context: torch.Tensor) -> Sequence[torch.Tensor]:
-        """Return flow, masks and new pixels before their activations."""
-        if self.config.decoder == 'shared':
-            return self.shared_decoder(code, levels, context)
-        parts = (self.flow_decoder, self.mask_decoder, self.pixel_decoder)
-        return [code if part is None else part(code) for part in parts]

@@ -169,21 +169,16 @@ def learn_preference(features: Sequence[np.ndarray], marks: Sequence[int]) -> Pr
     return Preference(answer.x, mean, deviation)
 
 
-def leave_one_out(features: Sequence[np.ndarray], marks: Sequence[int],
-                  tolerance: int = 1) -> np.ndarray:
+def leave_one_out(features: Sequence[np.ndarray], marks: Sequence[int]) -> np.ndarray:
     """
     Say whether the marks are enough: whether each is found by what is learned from the others.
 
     :param features: as for learn_preference; marks: likewise, two at least.
-    :param tolerance: frames that it may be off.
-    :return: bool (N,).
+    :return: bool (N,), whether within a frame.
     """
-    def without(values: Sequence[Any], i: int) -> list[Any]:
-        return [*values[:i], *values[i + 1:]]
-
-    found = [learn_preference(without(features, i), without(marks, i)).best(features[i])
-             for i in range(len(marks))]
-    return np.abs(np.array(found) - marks) <= tolerance
+    found = [learn_preference([*features[:i], *features[i + 1:]], [*marks[:i], *marks[i + 1:]]
+                              ).best(features[i]) for i in range(len(marks))]
+    return np.abs(np.array(found) - marks) <= 1
 
 
 def _centre(mass: np.ndarray) -> np.ndarray:

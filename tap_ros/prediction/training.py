@@ -37,7 +37,6 @@ from tap_ros.training.frames import MappedFrames, ResidentFrames
 from tap_ros.training.inpainted import fill
 import torch
 
-DISCRIMINATOR_RATE = 2e-4  # their learning rate at its highest
 _SHOWN = 8  # episodes in a sample picture
 Item = tuple[int, Batch, Augmentation]  # of a step
 Gather = Callable[..., Batch]  # make_batch, of episodes, a Sampling and a numpy Generator
@@ -89,7 +88,7 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
     return run.Course(
         state, partial(_batches, gather, this.training, config), step,
         partial(_score, gather, this, state, autocast),
-        (config.learning_rate, DISCRIMINATOR_RATE), about, config.patience)
+        about, config.patience)
 
 
 def _make_networks(this: run.Run) -> tuple[PredictorNetwork, dict[str, torch.nn.Module]]:

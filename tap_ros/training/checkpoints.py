@@ -23,6 +23,7 @@ import torch
 
 Trained = TypeVar('Trained', bound=torch.nn.Module)
 
+DISCRIMINATOR_RATE = 2e-4
 _REMEDY = 'remove it to begin anew, or choose another --out folder'
 
 
@@ -61,19 +62,17 @@ class TrainingState(Generic[Trained]):
             self.best_score, self.best_step = score, self.step
             self.best = {name: value.clone() for name, value in self.average.state_dict().items()}
 
-    def set_rates(self, steps: int, warmup: int, *highest: float) -> None:
+    def set_rates(self, steps: int, warmup: int) -> None:
         """
         Set this step's learning rates: a linear rise, then half a cosine down to 2 %.
 
-        :param steps: length of the training.
-        :param warmup: steps of the rise.
-        :param highest: of each optimizer, the rate after the rise.
+        :param steps: length of the training; warmup: steps of the rise.
         """
         rise = min(1.0, (self.step + 1) / (warmup + 1))
         fall = 0.5 + 0.5 * math.cos(math.pi * self.step / steps)
-        for optimizer, rate in zip(self.optimizers, highest):
+        for optimizer in self.optimizers:
             for group in optimizer.param_groups:
-                group['lr'] = rate * rise * (0.02 + 0.98 * fall)
+                group['lr'] = optimizer.defaults['lr'] * rise * (0.02 + 0.98 * fall)
 
     def clip_gradients(self, most: float) -> torch.Tensor:
         """Scale the network's gradients down to the norm `most`, 0: any; return what it was."""
@@ -101,7 +100,7 @@ def start(network: Trained, learning_rate: float, device: torch.device,
     Begin a training run.
 
     :param network: with fresh weights.
-    :param learning_rate: of Adam.
+    :param learning_rate: of Adam at its highest; of discriminators it is DISCRIMINATOR_RATE.
     :param helpers: dict of the networks that only training needs. Those whose name ends in
         'discriminator' are trained against the others.
     :return: TrainingState.
@@ -115,7 +114,8 @@ def start(network: Trained, learning_rate: float, device: torch.device,
     # DCGAN's beta1 of 0.5 where networks are trained against each other.
     betas = (0.5 if groups[1] else 0.9, 0.999)
     optimizers: list[torch.optim.Optimizer] = [
-        torch.optim.Adam(group, learning_rate, betas, fused=True) for group in groups if group]
+        torch.optim.Adam(group, rate, betas, fused=True)
+        for group, rate in zip(groups, (learning_rate, DISCRIMINATOR_RATE)) if group]
     return TrainingState(network, average, helpers, optimizers)
 
 

@@ -10,6 +10,7 @@ and a score are.
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 import hashlib
 import json
 import os
@@ -50,7 +51,6 @@ class Run:
         Reading.
     :param kind: of the weights file, 'predictor' or 'forward_model'.
     :param training: indices of the episodes to train on; held_out: of those to score.
-    :param data_hash: of the recordings and of marks on them.
     """
 
     config: Any
@@ -60,7 +60,15 @@ class Run:
     training: np.ndarray
     held_out: np.ndarray
     progress: bool
-    data_hash: str
+
+    @cached_property
+    def data_hash(self) -> str:
+        """What tells from which data a checkpoint is: recordings, and marks if there are."""
+        marks = getattr(self.config, 'marks', '')
+        if not marks or not Path(marks).is_file():  # who reads them says so
+            return self.store.data_hash
+        return hashlib.sha256(
+            self.store.data_hash.encode() + Path(marks).read_bytes()).hexdigest()
 
     @property
     def checkpoint(self) -> Path:
@@ -89,7 +97,6 @@ class Course(Generic[Trained, Item]):
     :param step: moves the weights once; returns a function to the numbers that curves show of it.
         The first two are on the progress bar.
     :param score: makes the scores of the averaged network and pictures (H, W, 3), both by name.
-    :param rates: of each optimizer, the learning rate at its highest.
     :param about: what else the weights file tells of the run; what JSON can hold.
     :param patience: steps after which the run ends if the score 'relative', of the held-out
         episodes, has not become smaller; the weights are then those with the smallest. 0: never.
@@ -99,7 +106,6 @@ class Course(Generic[Trained, Item]):
     batches: Callable[[int, int], Iterable[Item]]
     step: Callable[[Item], Callable[[], Numbers]]
     score: Callable[[], tuple[Numbers, Mapping[str, np.ndarray]]]
-    rates: tuple[float, ...]
     about: Mapping[str, Any] = field(default_factory=dict)
     patience: int = 0
 
@@ -158,17 +164,9 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
                                  'by itself; name whole bags, not files of a split one')
         warn_if_few(parts[1])
         torch.manual_seed(config.seed)
-        this = Run(config, kind, device, store, *parts, progress,
-                   _data_hash(store, getattr(config, 'marks', '')))
+        this = Run(config, kind, device, store, *parts, progress)
         _train(this, prepare(this), min(config.steps, stop_at or config.steps), after_step)
     return str(Path(config.out) / f'{kind}.safetensors')
-
-
-def _data_hash(store: EpisodeStore, marks: str) -> str:
-    """Return what tells from which data a checkpoint is: recordings, and marks if there are."""
-    if not marks or not Path(marks).is_file():  # who reads them says so
-        return store.data_hash
-    return hashlib.sha256(store.data_hash.encode() + Path(marks).read_bytes()).hexdigest()
 
 
 def paths_of(config: Any) -> list[str]:
@@ -191,7 +189,7 @@ def _train(run: Run, course: Course[Trained, Item], last: int,
         began = time.monotonic() - state.seconds
         batches = course.batches(state.step, last) if course.patient else ()
         for step, item in enumerate(batches, start=state.step):
-            state.set_rates(config.steps, config.warmup, *course.rates)
+            state.set_rates(config.steps, config.warmup)
             numbers = course.step(item)
             state.update_average(config.average_decay)
             state.step = step + 1

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.planning.protocols import Problem, SearchConfig
-from tap_ros.planning.solvers.icem import coloured_root, icem
+from tap_ros.planning.solvers.icem import icem
 from tap_ros.plugins import load_plugin, names
 from tap_ros.search import cross_entropy
 
@@ -81,7 +81,6 @@ def test_icem_moves_on_in_one_direction():
     np.testing.assert_allclose(steps.var(0), 1, atol=0.1)
     assert (steps[:, 1:] * steps[:, :-1]).mean() > 0.4  # a displacement tells of the next one
     assert abs(np.prod(steps, axis=2).mean()) < 0.1  # but x nothing of y
-    np.testing.assert_allclose(coloured_root(moves, 0.0), np.eye(moves), atol=1e-12)
 
 
 def test_a_cost_of_minus_infinity_ends_the_search_with_its_sample():

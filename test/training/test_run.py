@@ -146,9 +146,9 @@ def load_average(config):
 
 
 def test_learning_rate_rises_and_falls_and_the_average_moves_fast_at_first():
-    state, rates = start(torch.nn.Linear(3, 2), 1e-3, 'cpu'), []
+    state, rates = start(torch.nn.Linear(3, 2), 1.0, 'cpu'), []
     for state.step in range(1000):
-        state.set_rates(1000, 10, 1.0)
+        state.set_rates(1000, 10)
         rates.append(state.optimizers[0].param_groups[0]['lr'])
     assert rates[0] < 0.1 and max(rates) == pytest.approx(1, abs=0.01)
     assert rates[-1] == pytest.approx(0.02, abs=0.001)

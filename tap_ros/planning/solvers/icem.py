@@ -52,16 +52,16 @@ def icem(problem: Problem, config: SearchConfig, rng: np.random.Generator) -> So
     return judged_once_more(problem, best, costs)
 
 
-def coloured_root(count: int, beta: float = BETA) -> np.ndarray:
+def coloured_root(count: int) -> np.ndarray:
     """
     Return what colours white noise over time.
 
     :param count: T.
-    :return: (T, T); times white noise (T, ...) it has the spectrum 1 / f^beta and variance 1.
+    :return: (T, T); times white noise (T, ...) it has the spectrum 1 / f^BETA and variance 1.
     """
     if not count:
         return np.zeros((0, 0))
-    power = np.maximum(np.abs(np.fft.fftfreq(count)), 1 / count) ** -beta
+    power = np.maximum(np.abs(np.fft.fftfreq(count)), 1 / count) ** -BETA
     correlation = np.fft.ifft(power).real
     lags = np.subtract.outer(np.arange(count), np.arange(count)) % count
     root: np.ndarray = np.linalg.cholesky(correlation[lags] / correlation[0])
