@@ -83,21 +83,23 @@ def record_files(folder, *parts):
     return folder
 
 
-def write_mcap(path, messages, topics=(), schema=None, **options):
+def write_mcap(path, messages, topics=(), schema=None, encoding='cdr', **options):
     """
     Write messages as another writer would.
 
     :param topics: (topic, type) of which there need be no message.
     :param schema: bytes of every definition; by default it is right.
+    :param encoding: of the messages.
     :param options: of mcap's Writer.
     """
+    messages = list(messages)
     with open(path, 'wb') as stream:
         writer, numbers = Writer(stream, **options), {}
         writer.start('ros2')
         for topic, kind in dict.fromkeys((*topics, *((one[0], one[1]) for one in messages))):
             text = schema_text(kind).encode() if schema is None else schema
             numbers[topic, kind] = writer.register_channel(
-                topic, 'cdr', writer.register_schema(kind, 'ros2msg', text))
+                topic, encoding, writer.register_schema(kind, 'ros2msg', text))
         for topic, kind, data, log in messages:
             writer.add_message(numbers[topic, kind], log, data, log)
         writer.finish()

@@ -13,8 +13,7 @@ import sys
 from types import SimpleNamespace
 
 import cv2
-from made_bags import camera, joints, record, SECOND
-from mcap.writer import Writer as McapWriter
+from made_bags import camera, joints, record, SECOND, write_mcap
 import numpy as np
 import pytest
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -76,21 +75,6 @@ def write_packed(folder):
     return folder
 
 
-def write_mcap(path, messages):
-    """Write (topic, type, data, log time, schema encoding, encoding)."""
-    with open(path, 'wb') as stream:
-        writer = McapWriter(stream)
-        writer.start()
-        channels = {}
-        for topic, kind, data, log, schema_encoding, encoding in messages:
-            if (topic, kind) not in channels:
-                channels[topic, kind] = writer.register_channel(
-                    topic, encoding, writer.register_schema(kind, schema_encoding, b''))
-            writer.add_message(channels[topic, kind], log, bytes(data), log)
-        writer.finish()
-    return path
-
-
 @pytest.mark.parametrize('write, name', [
     (write_sqlite3, 'bag'), (write_bare_db3, ''), (write_unmerged, ''), (write_packed, 'bag')])
 def test_bags_in_sqlite3_say_what_a_bag_of_ours_says(write, name, tmp_path):
@@ -117,7 +101,7 @@ def test_what_is_beside_a_file_is_read_and_stays_as_it_is(tmp_path):
 
 def test_mcap_beside_other_bags_is_refused_by_name(tmp_path):
     path = write_bare_db3(tmp_path)
-    write_mcap(tmp_path / 'two.mcap', [(*one, '', 'cdr') for one in SENT])
+    write_mcap(tmp_path / 'two.mcap', SENT)
     with pytest.raises(RecordingError, match='bare.db3'):
         open_recordings(tmp_path)
     assert len(open_recordings(path)) == len(open_recordings(tmp_path / 'two.mcap')) == 1
@@ -148,14 +132,15 @@ def test_messages_that_are_not_read_are_named_instead_of_a_topic_to_choose(tmp_p
             ('foxglove.RawImage', 'protobuf', 'encoded as protobuf; only those of ROS 2 are read'),
             ('foxglove_msgs/msg/CompressedVideo', 'cdr', 'holds packets of a video'),
             ('sensor_msgs/Image', 'ros1', 'encoded as ros1')):
-        path = write_mcap(tmp_path / 'a.mcap', [(TOPIC, kind, b'x', SECOND, '', encoding)])
+        path = write_mcap(
+            tmp_path / 'a.mcap', [(TOPIC, kind, b'x', SECOND)], schema=b'', encoding=encoding)
         with pytest.raises(RecordingError, match=words) as error:
             open_recordings(path)
         assert '--image-topic' not in str(error.value)
 
 
 def test_what_is_no_bag_but_will_be_one_is_told_with_the_command(tmp_path, capsys):
-    whole = write_mcap(tmp_path / 'whole.mcap', [(*camera(t), '', 'cdr') for t in (1, 2)])
+    whole = write_mcap(tmp_path / 'whole.mcap', map(camera, (1, 2)))
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'bag_0.mcap.zst').write_bytes(zstandard.compress(whole.read_bytes()))
     assert [len(episode) for episode in open_recordings(tmp_path / 'bag')] == [2]
