@@ -16,8 +16,7 @@ from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import Plane, TOP
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
-from tap_ros.tracking.registration import register
-from tap_ros.tracking.search import locate, mean_shift
+from tap_ros.tracking.registration import locate, mean_shift, register
 from tap_ros.tracking.silhouette import clicked, middle, RADIUS, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template
 
