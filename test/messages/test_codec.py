@@ -10,6 +10,7 @@ import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.errors import ImageError, PlanningError
+from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.messages import images, objects
 from tap_ros.nodes import ros_messages
 
@@ -124,3 +125,11 @@ def test_pixels_outside_the_picture_are_refused_with_the_bounds():
             objects.decode_objects(message, 'objects', (48, 64))
     border = some_objects([[-0.5, 47.5], [63.5, -0.5]])
     assert len(objects.decode_objects(border, 'objects', (48, 64))[0]) == 2
+
+
+def test_an_object_beside_the_part_that_the_weights_see_is_named():
+    cut = TrainedCrop(Crop('centre', 64), (480, 640), (64, 64)).of((480, 640), 'start')
+    with pytest.raises(PlanningError, match=r'start: red not in the part of the picture that the '
+                                            r'weights see, 480x480 pixels from \(80, 0'):
+        objects.decode_cut_objects(
+            some_objects([[20, 200], [100, 200]]), 'start', (480, 640), cut)

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of visual_mpc_node without the node: checks of a goal, and plans drawn over pictures."""
+"""Laws of the plans that are drawn over pictures."""
 
 from types import SimpleNamespace
 
@@ -8,16 +8,7 @@ import numpy as np
 from sim_bridge.world.looks import get_look
 from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.images.drawing import OBJECT_COLOURS
-from tap_ros.nodes.planner.plan_view import (
-    CHOSEN,
-    draw_plan,
-    ELITES,
-    fingertip_pixels,
-    GRIPPER,
-    LARGEST,
-    SCALE,
-    way,
-)
+from tap_ros.nodes.planner import plan_view
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.weights import FORWARD_MODEL
 
@@ -48,30 +39,34 @@ def test_fingertips_are_drawn_where_the_camera_sees_them():
     camera = get_look('hand').camera(False, 64, 64)
     config = LearnedForwardModel.load(FORWARD_MODEL).config
     points = np.random.default_rng(0).uniform(WORKSPACE_LOW, WORKSPACE_HIGH, (200, 3))
-    gaps = np.linalg.norm(fingertip_pixels(config, points) - camera.project(points), axis=1)
+    seen = plan_view.fingertip_pixels(config, points)
+    gaps = np.linalg.norm(seen - camera.project(points), axis=1)
     assert gaps.max() < 3 and gaps.mean() < 1.5
     # At the table, where objects are pushed, the arm's offset counts for nothing.
     low = np.array([[0.2, -0.1, 0.0]])
-    np.testing.assert_allclose(fingertip_pixels(ABOVE, low), [[44, 38]])
-    np.testing.assert_allclose(fingertip_pixels(ABOVE, low + [0, 0, 0.1]), [[44, 34]])
+    np.testing.assert_allclose(plan_view.fingertip_pixels(ABOVE, low), [[44, 38]])
+    np.testing.assert_allclose(plan_view.fingertip_pixels(ABOVE, low + [0, 0, 0.1]), [[44, 34]])
 
 
 def test_all_ways_the_targets_and_the_gripper_are_where_they_belong():
     ways = [straight(-0.3, 0), straight(0.2, 0.4), straight(-0.1, 0.5)]
-    canvas = draw_plan(GREY, ABOVE, plan_of(*ways), HAND, TARGETS)
-    assert canvas.shape == (64 * SCALE, 64 * SCALE, 3) and canvas.dtype == np.uint8
-    middle = [fingertip_pixels(ABOVE, way(one, HAND)[8:9])[0] for one in ways]
-    assert shown(canvas, middle[0]) == CHOSEN
+    canvas = plan_view.draw_plan(GREY, ABOVE, plan_of(*ways), HAND, TARGETS)
+    side = 64 * plan_view.SCALE
+    assert canvas.shape == (side, side, 3) and canvas.dtype == np.uint8
+    middle = [plan_view.fingertip_pixels(ABOVE, plan_view.way(one, HAND)[8:9])[0] for one in ways]
+    assert shown(canvas, middle[0]) == plan_view.CHOSEN
     for place in middle[1:]:  # a thin line has no pixel of its own colour alone
-        assert np.abs(np.subtract(shown(canvas, place), ELITES)).max() < 60
-    assert shown(canvas, fingertip_pixels(ABOVE, HAND[None, :3].astype(float))[0]) == GRIPPER
+        assert np.abs(np.subtract(shown(canvas, place), plan_view.ELITES)).max() < 60
+    here, = plan_view.fingertip_pixels(ABOVE, HAND[None, :3].astype(float))
+    assert shown(canvas, here) == plan_view.GRIPPER
     for k, target in enumerate(TARGETS):
         assert shown(canvas, target) == OBJECT_COLOURS[k]
     touched = (canvas != 90).any(-1).mean()
     assert 0.01 < touched < 0.1, 'most of the picture stays as it is'
-    wide = draw_plan(np.zeros((160, 320, 3), np.uint8), ABOVE, plan_of(*ways), HAND, TARGETS)
-    assert wide.shape[1] == LARGEST
+    wide = plan_view.draw_plan(
+        np.zeros((160, 320, 3), np.uint8), ABOVE, plan_of(*ways), HAND, TARGETS)
+    assert wide.shape[1] == plan_view.LARGEST
     far = ForwardModelConfig(table=(60, 0, 1e9, 0, -60, 32, 0, 0, 1), arm=ABOVE.arm)
     nowhere = np.array([[np.nan, 3], [1e30, -1e30]], np.float32)
-    canvas = draw_plan(GREY, far, plan_of(*ways), HAND, nowhere)
+    canvas = plan_view.draw_plan(GREY, far, plan_of(*ways), HAND, nowhere)
     np.testing.assert_array_equal(canvas, 90)
