@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """predict_subgoal and the states of its node, asked over DDS, with small untrained networks."""
 
-from lifecycle import Lifecycle
 from lifecycle_msgs.msg import State, Transition
 from lively import lively_network
 import numpy as np
-from processes import Client, LocalNode, Newest, until
+from processes import Client, Lifecycle, LocalNode, Newest, until
 import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String

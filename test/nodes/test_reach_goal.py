@@ -7,11 +7,10 @@ import re
 import signal
 import threading
 
-from lifecycle import Lifecycle
 from lively import lively_network
 from loop import acts_like, SEED
 import numpy as np
-from processes import Newest, until
+from processes import Lifecycle, Newest, until
 import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
