@@ -71,21 +71,14 @@ def reached(yes, aim):
 
 
 class Tables:
-    """
-    The lines of each page's table: claim, paper, here, reached or missed, file.
-
-    :param folder: of the data.
-    """
-
-    def __init__(self, folder=RESULTS):
-        self._folder = folder
+    """The lines of each page's table: claim, paper, here, reached or missed, file."""
 
     def prediction(self):
         """Compare the paper's claims about prediction with what was measured."""
         def row(method, metric='gain_over_fix', task='push2', new_pixels=True,
                 mode='bidirectional'):
-            return self._find(PREDICTION, task=task, mode=mode, method=method, metric=metric,
-                              new_pixels=new_pixels)
+            return find(RESULTS, PREDICTION, task=task, mode=mode, method=method, metric=metric,
+                        new_pixels=new_pixels)
 
         def found(method, task='push2'):
             return row(method, 'bottleneck_frequency_2px', task, new_pixels=False)
@@ -139,11 +132,11 @@ class Tables:
     def planning(self):
         """Compare the paper's claims about planning with what was measured."""
         def final(task, method, metric='final_distance_cm', **about):
-            return self._find(PLANNING, task=task, method=method, metric=metric, **about)
+            return find(RESULTS, PLANNING, task=task, method=method, metric=metric, **about)
 
         def success(task, method, **about):
             metric = 'success_5cm_difference' if about else 'success_5cm'
-            return self._find(PLANNING, task=task, method=method, metric=metric, **about)
+            return find(RESULTS, PLANNING, task=task, method=method, metric=metric, **about)
 
         def points(row):
             return number(row, 100, 0, ' points', '+')
@@ -185,7 +178,7 @@ class Tables:
     def stacking(self):
         """Say how many towers stand."""
         def row(task, method, metric='success', **about):
-            return self._find(STACKING, task=task, method=method, metric=metric, **about)
+            return find(RESULTS, STACKING, task=task, method=method, metric=metric, **about)
 
         methods = {'direct': 'the goal picture alone', 'lowest_first': 'a rule: lowest first',
                    'shipped': 'via one predicted subgoal',
@@ -211,11 +204,8 @@ class Tables:
 
     def speed(self):
         """List what `make bench` measured."""
-        for row in json.loads((Path(self._folder) / 'speed.json').read_text())['rows']:
+        for row in json.loads((RESULTS / 'speed.json').read_text())['rows']:
             yield Row(**row).cells
-
-    def _find(self, file, **wanted):
-        return find(self._folder, file, **wanted)
 
 
 def markdown(lines, head=('claim', 'paper', 'here', 'aim', 'file')):
@@ -225,16 +215,16 @@ def markdown(lines, head=('claim', 'paper', 'here', 'aim', 'file')):
     return ''.join(f'| {" | ".join(row)} |\n' for row in (head, ('---',) * len(head), *lines))
 
 
-def page_path(name, folder=RESULTS):
+def page_path(name):
     """Return where a page is."""
-    return Path(folder).parent / 'speed.md' if name == 'speed' else Path(folder) / f'{name}.md'
+    return RESULTS.parent / 'speed.md' if name == 'speed' else RESULTS / f'{name}.md'
 
 
-def filled(name, folder=RESULTS):
+def filled(name):
     """Return a page, 'prediction', 'planning', 'stacking' or 'speed', with its table anew."""
-    text = page_path(name, folder).read_text()
+    text = page_path(name).read_text()
     head = {'head': ('what', 'here', 'ratio', 'aim', 'what limits it')} if name == 'speed' else {}
-    table = markdown(getattr(Tables(folder), name)(), **head)
+    table = markdown(getattr(Tables(), name)(), **head)
     if not MARKS.search(text):
         raise ConfigError(f'{name}.md: expected <!-- table --> and <!-- end -->')
     return MARKS.sub(lambda found: found[1] + table + found[2], text)

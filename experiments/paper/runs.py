@@ -107,11 +107,6 @@ class PaperRun:
                 + (f'-r{self.recursion}' if self.recursion > 1 else '') + f'-s{self.seed}')
 
     @property
-    def label(self):
-        """Name of the method in results."""
-        return label(self.method, self.variant, self.recursion)
-
-    @property
     def num_steps(self):
         """Length of the training."""
         return round(STEPS * LONG.get(self.variant, 1))

@@ -76,7 +76,7 @@ def sweep(runs, places, engine=LOCAL):
         folder = places.recording(name)
         # One that `collect` did not make stays as it is.
         if not folder.exists() or (folder / SETTINGS_FILE).exists():
-            collect(folder, RECORDINGS[name].collection, engine)
+            collect(folder, RECORDINGS[name], engine)
     tasks, failed = [Work(run.name, perform, (run, places)) for run in waiting], {}
     with tqdm(total=len(tasks), desc='paper', unit='run') as bar:
         for task, get in run_tasks(tasks, engine):

@@ -103,7 +103,6 @@ class Plan:
 
     action: np.ndarray  # (4,) float32: dx, dy, dz m over one control period, gripper opening
     expected_distance: float  # px, mean over objects, where the plan is predicted to end
-    current_distance: float  # px, mean over objects, before it
     planning_ms: float
     actions: np.ndarray  # (HORIZON, 4) the whole sequence
     elites: np.ndarray  # (E, HORIZON, 4) the best ones that were considered
@@ -172,8 +171,7 @@ class VisualMPC:
         # put each object's map at its pixel, look at the picture
         table, gripper = self.model.table, scene.gripper
         maps = table.seed_maps(torch.from_numpy(scene.object_pixels).to(table.device))
-        current = (maps.flatten(1) * goal.distances).sum(1).mean()
-        current, weights = to_numpy(current, maps.flatten(1))
+        weights, = to_numpy(maps.flatten(1))
         start = self.model.begin(
             to_float(scene.image)[None].to(table.device),
             torch.from_numpy(gripper)[None].to(table.device), self.config.arm_hidden)
@@ -188,7 +186,7 @@ class VisualMPC:
         _, (end,) = judge(goal.distances, actions[None], gripper[None], HORIZON)
         milliseconds = 1000 * (time.perf_counter() - begin)
         left, *kept = map(shift, parameters)
-        return Plan(actions[0], float(end), float(current), milliseconds, actions,
+        return Plan(actions[0], float(end), milliseconds, actions,
                     np.array(elites), goal.places, found.cost,
                     Memory(memory.seed, memory.count + 1, left, np.array(kept),
                            (float(gripper[2]), float(gripper[2] + actions[0, 2])), blocked))

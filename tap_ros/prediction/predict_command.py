@@ -160,7 +160,7 @@ def fit(picture: np.ndarray, window: Sequence[int], pixels: np.ndarray, size: Se
         raise ImageError(f'{name}: {W}x{H} pixels (width x height); the weights take pictures of '
                          f'the shape {size[1]}x{size[0]}; say which part of it is used, by --crop '
                          'centre or --crop LEFT,TOP,SIDE')
-    inside = pixels - np.float32([left, top])
+    inside = pixels - np.array([left, top], np.float32)
     if not in_picture(inside, (H, W)).all():
         raise ImageError(
             f'{name}: an object is outside the part that the weights see, {W}x{H} pixels from '
