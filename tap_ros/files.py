@@ -101,6 +101,15 @@ def only_writer(folder: str | Path) -> Iterator[None]:
         os.close(handle)
 
 
+def free_folder(wanted: str | Path) -> Path:
+    """Return this folder, or the first one with a number added that does not exist."""
+    folder, number = Path(wanted), 1
+    while folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        number += 1
+        folder = Path(f'{wanted}-{number}')
+    return folder
+
+
 def _lock(handle: int, wait: bool) -> bool:
     """Lock an open file or folder; say whether it could be."""
     try:

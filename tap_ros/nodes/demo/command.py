@@ -35,6 +35,7 @@ from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_ros.contract import ROBOT_MASKS, step_budget
 from tap_ros.errors import ConfigError, TapError
+from tap_ros.files import free_folder
 from tap_ros.messages.images import decode_image, decode_mask
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
@@ -44,7 +45,6 @@ from tap_ros.nodes.client import Client, positions_of, View
 from tap_ros.nodes.demo.film import GOAL, Run, Scene
 from tap_ros.nodes.demo.report import MODES, results_table, shown, summary, write_report
 from tap_ros.nodes.node_processes import NodeProcesses
-from tap_ros.nodes.recorder.bags import free_folder
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.options import Folder, one_of
 from tap_ros.plugins import names
