@@ -78,6 +78,7 @@ class _Bag:
         self.every: dict[tuple[str, str], Channel] = {}  # by topic and type
         self.counts = Counter[str]()  # of messages with the types, as far as they are known
         counts = Counter[tuple[str, str]]()
+        self.unusable: dict[str, str] = {}  # why no picture of a topic can be used
         damage = []
         for file in map(open_file, files):
             file.topics()
@@ -132,6 +133,10 @@ class _Bag:
             raise RecordingError(
                 f'{self.source}: no topic ends in {IMAGE.recorded} with type {IMAGE.type}; name '
                 f'the camera topic (--image-topic) if it is called otherwise; {self.known}')
+        if all(self.picture(topic) is None for topic in left) and len(left) > 1:
+            why = '; '.join(f'{escaped(topic)}: {self.unusable[topic]}' for topic in left[:3])
+            raise RecordingError(f'{self.source}: none of its topics of pictures can be used: '
+                                 f'{self.listing(left)}; {why}')
         if len(left) > 1:
             raise RecordingError(
                 f'{self.source}: several topics could be {IMAGE.recorded}: {self.listing(left)}; '
@@ -176,9 +181,12 @@ class _Bag:
 
     def picture(self, topic: str) -> np.ndarray | None:
         """Return one of the first pictures of a topic, None without any that can be used."""
+        self.unusable[topic] = 'damaged'
         for message in self._first(topic):
-            with suppress(ImageError):
+            try:
                 return decode_image(message)
+            except ImageError as error:
+                self.unusable[topic] = str(error)
         return None
 
     def is_coloured(self, topic: str) -> bool:
