@@ -33,6 +33,7 @@ _FEW, _LONG = 3, 30  # messages beside a place that are too few, or enough, to t
 _MANY = 10  # messages of one stamp, of which no driver sends so many together
 _SMOOTH = 9  # messages that tell how far two clocks are apart
 _STREAMS = ('frame', 'twist', 'joint', 'arm', 'object')
+_OF_ANOTHER = 'are of another clock than the camera, which is ahead or behind'
 
 
 def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str],
@@ -201,9 +202,6 @@ def _stamped(name: str, tracks: dict[str, Track], gaps: np.ndarray) -> tuple[Tra
         'go back' if _jumps(track, tracks['mark'], gaps, False) else
         _OF_ANOTHER if _is_apart(track, frame) else '')
     return replace(track, stamp=by_log) if why else track, why
-
-
-_OF_ANOTHER = 'are of another clock than the camera, which is ahead or behind'
 
 
 def _repeats(track: Track, name: str) -> bool:

@@ -50,7 +50,7 @@ def run(args: Options) -> None:
         numbers = count()
         for file in files:
             with lacking.passing_over('file', escaped(file.name)):
-                for number, pictures in zip(numbers, _episodes(_open(file), args.camera)):
+                for pictures, number in zip(_episodes(_open(file), args.camera), numbers):
                     with lacking.passing_over('episode', str(number)):
                         frames, rows = decoded(pictures, lambda each: args.cut.image(_picture(
                             each)), lacking, f'episode {number}')
