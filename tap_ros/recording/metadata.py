@@ -23,6 +23,7 @@ import yaml
 
 FILE_NAME, MOUNT_NAME = 'metadata.yaml', 'arm_mount.json'
 MAX_BYTES = 2**23  # of metadata.yaml
+DEEPEST = 50  # levels of it; rosbag2 writes 8
 _UNUSABLE = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _KEY = 'rosbag2_bagfile_information'
@@ -70,6 +71,17 @@ def bag_information(files: Sequence[dict[str, Any]]) -> dict[str, Any]:
         'custom_data': None,
         'ros_distro': 'jazzy',
     }
+
+
+def from_yaml(text: str | bytes) -> Any:
+    """Return a value; raise ValueError for one so deep that libyaml would end the process."""
+    depth = 0
+    for event in yaml.parse(text, _LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise ValueError(f'it is more than {DEEPEST} levels deep')
+    return yaml.load(text, _LOADER)
 
 
 def to_yaml(value: Any) -> str:
@@ -125,10 +137,12 @@ def bag_files(folder: str | Path) -> list[Path]:
         raise RecordingError(f'{path}: not a regular file')
     try:
         with open(path, 'rb') as stream:
-            information = yaml.load(stream.read(MAX_BYTES), _LOADER)[_KEY]
+            information = from_yaml(stream.read(MAX_BYTES))[_KEY]
         storage, paths = information['storage_identifier'], information['relative_file_paths']
         if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
             raise ValueError('relative_file_paths is no list of names')
+        if len(set(paths)) < len(paths):
+            raise ValueError('relative_file_paths names a file twice')
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     except _UNUSABLE as error:
@@ -141,14 +155,21 @@ def bag_files(folder: str | Path) -> list[Path]:
             f'{path}: the bag is stored as {escaped(storage, 40)}; mcap and sqlite3 are read; '
             'make one of these with ros2 bag convert where its storage is installed')
     files = [folder / Path(name).name for name in paths]
-    files = [file.with_suffix('') if file.suffix in PACKED and not file.is_file() else file
+    files = [file if _is_file(file) else file.with_suffix('') if file.suffix in PACKED else file
              for file in files]  # some were unpacked since
-    missing = [file.name for file in files if not file.is_file()]
+    missing = [file.name for file in files if not _is_file(file)]
     if missing:
         raise RecordingError(
             f'{path} names files that are not there: {listing(missing)}; bring them back, or '
             'make metadata.yaml anew (ros2 bag reindex)')
     return files
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
 
 
 @dataclass(frozen=True)

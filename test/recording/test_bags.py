@@ -84,6 +84,9 @@ def test_metadata_that_cannot_be_used_is_named_in_one_line(bag):
             (good.replace('push2_1.mcap', 'push2_7.mcap'), 'not there: push2_7.mcap'),
             (good.replace('rosbag2_bagfile_information', 'nothing'), 'not the metadata'),
             (begin + 'relative_file_paths: [[a]]', 'not the metadata'),
+            (begin + 'relative_file_paths: [push2_0.mcap, push2_0.mcap]', 'a file twice'),
+            (begin + 'version: ' + '[' * 100_000, 'levels deep'),
+            (begin + f'relative_file_paths: [{"a" * 5000}]', 'not there'),
             (begin + 'relative_file_paths: [..]', 'not there'),
             (begin + 'relative_file_paths: ["a\\0b\\e[2J\\n"]', 'not'), ('', ''),
             ('!!python/object/apply:os.system [true]', 'not the metadata')):
