@@ -170,7 +170,7 @@ class Tables:
             more = success(task, ours, *file, compares='fix')
             yield (f'success, {title}: via `fix`; via the subgoal minus via `fix`', '', '; '.join((
                 number(success(task, fix, *file), 100), points(more))),
-                reached(more['value'] >= 0.2, '20 points'), *file or [PLANNING])
+                reached(more['value'] >= 0.2, '20 points'), *(file or [PLANNING]))
         more = [success(task, ours, *file, compares='direct')
                 for (task, _, ours), *file in ((late,), (late3, LATE))]
         yield ('success, trained on late bottlenecks, via the subgoal minus direct: two; three in '
