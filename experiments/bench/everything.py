@@ -38,7 +38,7 @@ def run(args):
         'command': 'make bench', 'date': time.strftime('%Y-%m-%d'),
         'machine': f'{len(os.sched_getaffinity(0))} cores, {processor()}',
         'python': platform.python_version(), 'torch': torch.__version__,
-        'rows': [asdict(row) for row in rows]}, indent=1) + '\n')
+        'rows': [asdict(row) for row in rows]}, indent=1, default=bool) + '\n')
     print(f'wrote {args.out}')
 
 
