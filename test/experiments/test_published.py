@@ -14,6 +14,7 @@ from experiments.paper.rows import as_frame, group_runs, make_rows
 from experiments.tables import (
     find,
     FIX,
+    LATE,
     OURS,
     PLANNING,
     PREDICTION,
@@ -88,7 +89,7 @@ def test_every_interval_on_a_page_stands_in_the_data(page):
     for name, factor, digits in (('min_l1', 1, 4), ('bottleneck_2px', 100, 0)):
         known |= {tuple(f'{factor * bound:.{digits}f}' for bound in (
             run['scores'][name], *run['intervals'][name])) for run in wide}
-    missing = found - known.union(*map(values_of, (PREDICTION, PLANNING, STACKING)))
+    missing = found - known.union(*map(values_of, (PREDICTION, PLANNING, LATE, STACKING)))
     assert len(found) >= 4 and not missing
 
 
