@@ -203,7 +203,7 @@ def _ray(engine: Engine) -> Iterator[Workers]:
             f'engine: Ray does not answer at {engine.address or "this machine"} '
             f'({escaped(error)}); start it with `ray start`, or correct --address') from error
     room = engine.workers or 2 * int(ray.cluster_resources().get('CPU', 1))
-    remote = ray.remote(num_cpus=1, max_retries=0)(lambda function, args: function(*args))
+    remote: Any = ray.remote(num_cpus=1, max_retries=0)(lambda function, args: function(*args))
     try:
         yield (lambda task: remote.remote(task.function, task.args).future()), room, (
             exceptions.WorkerCrashedError, exceptions.NodeDiedError, exceptions.OutOfMemoryError,
