@@ -86,7 +86,7 @@ class TrackerNode(Node):
         self._gripper = GripperHistory(
             declared_arm(self.params), self.params['joint_prefix'], self.params['fixed_opening'])
         camera = camera_topics(self.params)
-        self._own_topics = [name for _, name in camera.values()]  # of one publisher each
+        self._own_topics = [camera['image'][1]]  # another camera sends pictures
         del camera['objects']
         goal = goal_topics(self.params['robot_mask'])
         del goal['objects']
