@@ -121,24 +121,25 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], object],
                       clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, frozenset[bytes]]:
-    """Return who publishes each topic of which there may be but one publisher."""
-    return {topic: frozenset(
-        bytes(info.endpoint_gid[:12])  # the participant, which is known before all its topics
-        for info in node.get_publishers_info_by_topic(topic))
+def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, dict[bytes, str]]:
+    """Return {topic: {participant: node}} of topics of which there may be but one publisher."""
+    return {topic: {
+        bytes(info.endpoint_gid[:12]): info.node_name  # known before all topics of a node
+        for info in node.get_publishers_info_by_topic(topic)}
         for topic in map(node.resolve_topic_name, topics)}
 
 
-def rivals(node: Node, topics: Iterable[str], known: Mapping[str, frozenset[bytes]]) -> str:
+def rivals(node: Node, topics: Iterable[str], known: Mapping[str, Mapping[bytes, str]]) -> str:
     """
     Say how many publish a topic where one of them, such as a second camera, is new; else ''.
 
     :param known: what publishers_of returned before.
     """
-    before = frozenset().union(*known.values())
+    before: set[bytes] = set().union(*known.values())
     for topic, publishers in publishers_of(node, topics).items():
-        if len(publishers) > 1 and not publishers <= before:
-            return f'{len(publishers)} nodes publish on {topic} now'
+        if len(publishers) > 1 and publishers.keys() - before:
+            return (f'{len(publishers)} nodes publish on {topic} now, '
+                    f'{listing(sorted(publishers.values()))}')
     return ''
 
 

@@ -56,7 +56,7 @@ class Selection:
     size: tuple[int, int]  # (height, width) of its pictures
     selected_ns: int  # stamp of the picture in which they were clicked
     jumps: int  # of the clock of the stamps until then
-    publishers: Mapping[str, frozenset[bytes]]  # of each topic then
+    publishers: Mapping[str, Mapping[bytes, str]]  # of each topic then
     stamp_ns: int  # of the newest picture in which they were followed
     received: float  # s, monotonic: when that picture was received
     tracked: Tracked
