@@ -12,10 +12,11 @@ import json
 from pathlib import Path
 
 from experiments.pages import render, share
+from experiments.paper.figures import COLOURS, INK, new_figure, to_png
+from experiments.tables import markdown, reached
 from experiments.worlds.command import read
 from experiments.worlds.trained import held_out_of, mark, MARKED, marks_of
 import numpy as np
-import pandas as pd
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError
@@ -56,7 +57,7 @@ class Options:
     :param seeds: trainings of each point.
     :param bags: folder of the bags; what is there is kept.
     :param runs: folder of the trainings, likewise.
-    :param out: folder for few.json and few.md.
+    :param out: folder for few.json, few.png and few.md.
     """
 
     real: Folder = ''
@@ -82,11 +83,12 @@ def run(args):
 
 
 def write(found, folder):
-    """Write few.json and few.md."""
+    """Write few.json, few.png and few.md."""
     parts = ('[' + ',\n'.join(map(json.dumps, value)) + ']' if isinstance(value, list)
              else json.dumps(value) for value in found.values())
     write_atomically(folder / 'few.json', '{' + ',\n'.join(
         f'"{name}": {part}' for name, part in zip(found, parts)) + '}\n')
+    write_atomically(folder / 'few.png', draw(found))
     write_atomically(folder / 'few.md', page(found))
 
 
@@ -161,27 +163,51 @@ def relative(rows):
     return against_copying(*(each.mean(0) if each.ndim == 2 else each for each in found))
 
 
-def page(found):
-    """Write the page of the results."""
-    lines = []
+def lines(found):
+    """Return the lines of the table: claim, paper, here, aim, file, see tables.markdown."""
     for count in dict.fromkeys(row['demonstrations'] for row in found['curve']):
         rows = [row for row in found['curve'] if row['demonstrations'] == count]
         beside = np.array([row['beside'] for row in rows])
-        hit, near = (mean_interval((beside <= most).mean(0)) for most in (0, 1))
-        lines.append({'demonstrations': count, 'error / copying': _text(relative(rows)[1]),
-                      'hits': share(hit), 'within a frame': share(near)})
-    rows, real = found['real'], {}
-    if rows:
-        verdict, ratio = relative(rows)
-        real = {'error': np.mean([row['error'] for row in rows]),
-                'copying': np.mean([row['copying'] for row in rows]), 'ratio': _text(ratio),
-                'won': sum(row['error'] < row['copying'] for row in rows), 'count': len(rows),
-                'verdict': verdict}
+        hit, near = (share(mean_interval((beside <= most).mean(0))) for most in (0, 1))
+        yield _line(f'{count} simulated', rows, f'; {hit}; {near}')
+    if found['real']:
+        yield _line(f'{len(found["real"])} real', found['real'])
+
+
+def _line(which, rows, more=''):
+    ratio = relative(rows)[1]
+    what = '; matched in the bottleneck; at most a frame beside' if more else ''
+    return (f'{which}: error / copying{what}', '',
+            '{:.2f} ({:.2f} to {:.2f})'.format(*ratio) + more,
+            reached(ratio.high < 1, 'below 1'), 'few.json')
+
+
+def draw(found):
+    """Draw the error, as a multiple of that of copying, over the number of demonstrations."""
+    groups = {}
+    for row in found['curve']:
+        groups.setdefault(f'{row["demonstrations"]}\nsimulated', []).append(row)
+    if found['real']:
+        groups[f'{len(found["real"])}\nreal'] = found['real']
+    ratios = np.array([relative(rows)[1] for rows in groups.values()])
+    figure, ((axis,),) = new_figure(2.5, 1)
+    axis.bar(range(len(groups)), ratios[:, 0], 0.6, color=COLOURS['ours'], capsize=3,
+             yerr=np.abs(ratios[:, 1:] - ratios[:, :1]).T, error_kw={'ecolor': INK})
+    axis.axhline(1, color=INK, linewidth=1)
+    axis.annotate('copying an input', (len(groups) - 0.5, 1), ha='right', va='bottom',
+                  fontsize=8, color=INK)
+    axis.set_xticks(range(len(groups)), groups)
+    axis.set_ylabel('error / copying', color=INK)
+    return to_png(figure)
+
+
+def page(found):
+    """Write the page of the results."""
+    real = {}
+    if found['real']:
+        rows = found['real']
+        real = {'count': len(rows), 'won': sum(row['error'] < row['copying'] for row in rows)}
     return render('templates/few.md.j2', task=found['task'], marked=MARKED, held_out=HELD_OUT,
                   steps=SETTINGS['steps'], batch=SETTINGS['batch_size'],
-                  seeds=1 + max(row['seed'] for row in found['curve']), curve=pd.DataFrame(lines),
-                  patience=REAL['patience'], real=real)
-
-
-def _text(interval):
-    return '{:.2f} ({:.2f} to {:.2f})'.format(*interval)
+                  seeds=1 + max(row['seed'] for row in found['curve']),
+                  table=markdown(lines(found)), patience=REAL['patience'], real=real)

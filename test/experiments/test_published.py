@@ -83,8 +83,7 @@ def test_every_interval_on_a_page_stands_in_the_data(page):
     text = ' '.join((ROOT / page).read_text().split())
     found = set(re.findall(
         r'(-?\d+(?:\.\d+)?)[^()\d]{0,60}\((-?\d+(?:\.\d+)?) to \+?(-?\d+(?:\.\d+)?)[,;)]', text))
-    mutants = json.loads((RESULTS / 'mutants.json').read_text())
-    known = {(f'{100 * mutants["killed"] / mutants["tried"]:.0f}', '81', '92')}
+    known = set()
     wide = json.loads((RESULTS / 'wide.json').read_text())['runs']
     for name, factor, digits in (('min_l1', 1, 4), ('bottleneck_2px', 100, 0)):
         known |= {tuple(f'{factor * bound:.{digits}f}' for bound in (

@@ -16,6 +16,7 @@ import re
 import subprocess
 import time
 
+from experiments.paper.figures import COLOURS, INK, new_figure, to_png
 import pytest
 from tap_ros.errors import TapError
 from tap_ros.files import write_atomically, write_rows
@@ -31,6 +32,10 @@ or into a disk. *Held*: trials in which what must happen did happen. Numbers are
 trials unless said otherwise. `make faults` (about four hours) makes this page and
 [faults.json](faults.json), which has each row's machine, date and commit; `python -m pytest -m
 fault` tries each fault a few times. Damaged recordings and weights are in `make test`.
+
+![slowest reaction of all trials, and what was promised](faults.png)
+
+*The slowest reaction of all trials (bars) and what was promised (lines).*
 
 | injected | must happen | held | seen |
 | --- | --- | ---: | --- |
@@ -133,22 +138,43 @@ def save(folder, row):
     """
     Put a row into faults.json of a folder, in place of an older one, and write the page anew.
 
-    :param folder: of faults.json and faults.md.
+    :param folder: of faults.json, faults.md and faults.png.
     :param row: of Trials.row.
     """
     path = Path(folder) / 'faults.json'
     rows = {old['fault']: old for old in json.loads(path.read_text())} if path.exists() else {}
     rows[row['fault']] = row
     write_rows(path, rows.values())
+    write_atomically(path.with_suffix('.png'), draw(list(rows.values())))
     write_atomically(path.with_suffix('.md'), page(rows.values()))
+
+
+def draw(rows):
+    """Return a PNG of the slowest reactions, and of what was promised, in seconds."""
+    found = [(row['fault'], row['figure'], float(promised[1])) for row in rows
+             if row['what'].startswith('s until') and isinstance(row['figure'], float)
+             and 'median' not in row['what']
+             and (promised := re.search(r'([\d.]+) s\b', row['promise']))]
+    figure, ((axis,),) = new_figure(3, 1)
+    axis.barh(range(len(found)), [seconds for _, seconds, _ in found], color=COLOURS['ours'])
+    for n, (_, _, promised) in enumerate(found):
+        axis.plot([promised, promised], [n - 0.45, n + 0.45], color=COLOURS['genmin'])
+    axis.set_yticks(range(len(found)), [name for name, *_ in found])
+    axis.invert_yaxis()
+    axis.set(xscale='log', xlim=(0.05, 20))
+    axis.set_xlabel('s', color=INK)
+    return to_png(figure)
 
 
 def page(rows):
     """Return the page of all rows; rows of the same fault in several forms share a line."""
-    lines = {}
+    lines, rows = {}, list(rows)
     for row in rows:
         lines.setdefault((row['injected'], row['promise']), []).append(row)
-    return HEAD + ''.join(_line(*texts, rows) for texts, rows in lines.items())
+    missed = [f'- {row["injected"]}: {row["held"]} of {row["tried"]}.\n' for row in rows
+              if row['held'] < row['tried']]
+    return HEAD + ''.join(_line(*texts, rows) for texts, rows in lines.items()) + ''.join(
+        ['\n## What was missed\n\n', *missed] if missed else '')
 
 
 def _line(injected, promise, rows):
