@@ -50,6 +50,7 @@ def bars():
                 ['fixed time', FIXED, *succeeded(task, fix)],
                 ['here', HERE, *succeeded(task, ours)]]
         for task, title, fix, ours in (
+            ('order2', 'two in\norder, late', 'fix+late', 'genmin+relative+late'),
             ('order2', 'two in\norder', 'fix', 'shipped'),
             ('order3', 'three in\norder', 'fix+rounds:rounds2', 'shipped:rounds2'),
             ('push2', 'two\nanywhere', 'fix', 'shipped'))}
