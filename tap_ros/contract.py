@@ -26,7 +26,6 @@ GOAL_TOLERANCE = 1.0  # px; the planner takes a goal or subgoal for reached with
 
 WORLD_FRAME = 'world'  # frame of positions and commands
 CAMERA_FRAME = 'camera_optical_frame'  # of pictures: z looks ahead, x right, y down (REP 103)
-OBSERVER_FRAME = 'observer_optical_frame'  # of the view from the side
 
 # Names of the gripper's state in joint states: metres, and the opening from 0 to 1.
 GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')

@@ -14,11 +14,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from sim_bridge.world.looks import OBSERVER
 from sim_bridge.world_protocol import ability, Observation, World
 from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates
-from tap_ros.contract import CAMERA_FRAME, OBSERVER_FRAME, WORLD_FRAME
+from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.messages import topics
 from tap_ros.nodes import ros_messages
 from tap_ros.nodes.topics import LATCHED, STREAM
@@ -36,19 +35,22 @@ class ScenePublishers:
 
     :param node: rclpy Node.
     :param world: World; the description of its arm is latched.
-    :param observer: publish observer/image_raw, a view from the side, as well.
+    :param observer: publish observer/image_raw as well, the camera's view with the whole arm. It
+        is costly: drawn for those who look, and sent again only for those who have come since.
     :param tracked: publish objects and goal/objects under truth/: tracker_node publishes its own.
     """
 
     def __init__(self, node: Node, world: World, observer: bool, tracked: bool) -> None:
         self._newest: dict[str, Any] = {}  # topic -> the message sent last
-        streams = STREAMS | ({'observer/image_raw': Image} if observer else {})
         beside = 'truth/' if tracked else ''
         self._publishers = {topic: node.create_publisher(
             kind, f'{beside if kind is ObjectStates else ""}{topic}', qos)
-            for kinds, qos in ((streams, STREAM), (GOAL, LATCHED))
+            for kinds, qos in ((STREAMS, STREAM), (GOAL, LATCHED))
             for topic, kind in kinds.items()}
-        self._observer = observer
+        self._observer = None
+        if observer:
+            ability(world, 'observer_picture')  # refuses a world without
+            self._observer = node.create_publisher(Image, 'observer/image_raw', STREAM)
         self._pose = node.create_publisher(PoseStamped, topics.CAMERA_POSE.name, LATCHED)
         self._description = node.create_publisher(String, 'robot_description', LATCHED)
         if world.arm is not None:
@@ -73,9 +75,7 @@ class ScenePublishers:
                 world.camera_matrix, seen.image.shape[:2], stamp, CAMERA_FRAME),
             'camera/image_raw': ros_messages.encode_image(seen.image, stamp, CAMERA_FRAME),
             'camera/robot_mask': ros_messages.encode_mask(seen.robot_mask, stamp, CAMERA_FRAME)}
-        if self._observer:
-            self._newest['observer/image_raw'] = ros_messages.encode_image(
-                ability(world, 'observer_picture')(), stamp, OBSERVER_FRAME)
+        self._world, self._viewers = world, 0  # who has been sent the observer's picture of it
         if arm is not None:
             _send(self._moving, arm.transforms(seen.arm_joints), stamp)
         self.send_newest()
@@ -84,6 +84,12 @@ class ScenePublishers:
         """Send the newest moment, again if need be."""
         for topic, message in self._newest.items():
             self._publishers[topic].publish(message)
+        if self._observer is not None:
+            before, self._viewers = self._viewers, self._observer.get_subscription_count()
+            if self._viewers > before:
+                self._observer.publish(ros_messages.encode_image(
+                    ability(self._world, 'observer_picture')(), self._newest['clock'].clock,
+                    CAMERA_FRAME))
 
     def goal(self, goal: Observation, stamp: Time) -> None:
         """Publish the goal of a scene."""
@@ -103,8 +109,6 @@ class ScenePublishers:
                 'header': {'stamp': {'sec': stamp.sec, 'nanosec': stamp.nanosec},
                            'frame_id': WORLD_FRAME},
                 'pose': {'position': place, 'orientation': turn}}))
-        if hasattr(world, 'observer_picture'):
-            fixed.append(Transform(WORLD_FRAME, OBSERVER_FRAME, OBSERVER.pose))
         _send(self._fixed, fixed, stamp)
 
 

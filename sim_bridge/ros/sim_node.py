@@ -324,7 +324,7 @@ def declare_parameters(node: Node) -> Parameters:
         'appearance', OPTIONS['appearance'], 'Table, light and camera; random: drawn from '
         'the seed of each scene.', choices=list(CHOICES))
     parameters.declare(
-        'observer', False, 'Publish observer/image_raw, a view from the side for people.')
+        'observer', False, "Publish observer/image_raw, the camera's view with the whole arm.")
     parameters.declare(
         'objects', 'truth', 'Where the objects of all nodes come from: objects and goal/objects '
         "are the ground truth, or tracker_node's, and the truth is on truth/objects and "

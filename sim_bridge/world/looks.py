@@ -36,8 +36,6 @@ _NEAR = (0.73, 18.5, CAMERA_POSITION)
 GRIP_SPREAD = 0.65  # of the ranges in which objects to be gripped lie: that camera sees less
 LOOKS = {'hand': Look(False, _TABLE), 'arm': Look(True, _TABLE_AND_ARM)}
 DEFAULT_LOOK = 'hand'
-# For films: beside the camera, so that what is left in its pictures is left here, too.
-OBSERVER = Camera(400, 300, tilt=0.8, fovy=29.0, position=(0.4, -1.2, 1.35), turn=0.31)
 
 
 def get_look(name: str) -> Look:

@@ -40,18 +40,19 @@ class Studio:
     :param camera: Camera.
     :param arm: Arm.
     :param links: draw it whole; else the hand alone, as if the links were rendered away.
+    :param samples: along each side of a pixel.
     :raises SceneError: when nothing can be rendered.
     """
 
-    def __init__(self, camera: Camera, arm: Arm, links: bool) -> None:
-        self._camera, self._arm, self._links = camera, arm, links
+    def __init__(self, camera: Camera, arm: Arm, links: bool, samples: int = SAMPLES) -> None:
+        self._camera, self._arm, self._links, self._samples = camera, arm, links, samples
+        width, height = samples * camera.width, samples * camera.height
         self._joints = np.zeros(len(arm.joints))
         self._model = _studio_model(arm if links else None)
-        self._model.vis.global_.offwidth = SAMPLES * camera.width
-        self._model.vis.global_.offheight = SAMPLES * camera.height
+        self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         self._table_colour = self._model.mat('table').rgba.copy()
         self._data = mujoco.MjData(self._model)
-        self._gl = OpenGL(self._model, SAMPLES * camera.width, SAMPLES * camera.height)
+        self._gl = OpenGL(self._model, width, height)
         self._scene = mujoco.MjvScene(self._model, MAX_GEOMS)
         self._eye = mujoco.MjvCamera()
         self._eye.type, self._eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
@@ -78,7 +79,7 @@ class Studio:
         self._flatten = np.eye(3)
         self._flatten[:2, 2] = -light[:2] / light[2]
         self._flatten[2, 2] = 1e-4
-        self._table = _sees_table(camera)
+        self._table = _sees_table(camera, self._samples)
         mujoco.mj_forward(model, self._data)
         return camera
 
@@ -107,8 +108,9 @@ class Studio:
         label, shadow = labels[numbers, 0], labels[numbers, 1]
         shade = np.where((shadow != 0) & self._table, 1 - SHADOW, 1).astype(np.float32)
         shaded = colours * shade[..., None]
-        picture = sum(_samples(shaded)) / SAMPLES ** 2
-        mask = np.maximum.reduce(_samples(label))  # the robot's if one of its samples is
+        picture = sum(_samples(shaded, self._samples)) / self._samples ** 2
+        # Of a pixel the robot's if one of its samples is.
+        mask = np.maximum.reduce(_samples(label, self._samples))
         return np.rint(picture).astype(np.uint8), mask, self._joints.copy()
 
     def close(self) -> None:
@@ -251,15 +253,15 @@ def _wood(size: int = 256, planks: int = 7) -> np.ndarray:
 
 
 @lru_cache(4)
-def _sees_table(camera: Camera) -> np.ndarray:
+def _sees_table(camera: Camera, samples: int) -> np.ndarray:
     """Say which samples of a picture look at the table's top: bool (H, W), of all samples."""
-    fine = camera.resized(SAMPLES * camera.width, SAMPLES * camera.height)
+    fine = camera.resized(samples * camera.width, samples * camera.height)
     u, v = np.meshgrid(np.arange(fine.width), np.arange(fine.height))
     place = fine.on_table(np.stack([u, v], -1))
     return (np.abs(place) < TABLE_HALF).all(-1)
 
 
-def _samples(values: np.ndarray) -> list[np.ndarray]:
+def _samples(values: np.ndarray, samples: int) -> list[np.ndarray]:
     """Return the first sample of each pixel (H, W, ...), the second, and so on."""
-    return [values[row::SAMPLES, column::SAMPLES]
-            for row in range(SAMPLES) for column in range(SAMPLES)]
+    return [values[row::samples, column::samples]
+            for row in range(samples) for column in range(samples)]

@@ -5,14 +5,13 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import replace
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.world.camera import OneCamera
-from sim_bridge.world.looks import choose_appearance, DEFAULT_LOOK, get_look, OBSERVER, USUAL
+from sim_bridge.world.looks import choose_appearance, DEFAULT_LOOK, get_look, USUAL
 from sim_bridge.world.scene import (
     build_scene,
     FINGER_TRAVEL,
@@ -36,6 +35,7 @@ BENT = 0.1  # share of the fingers' travel that they may be beyond their ends
 GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
 GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
 GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the start
+OBSERVER_SIZE = 384  # pixels of the picture for people
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
 
 
@@ -212,11 +212,11 @@ class Table(OneCamera):
             object_poses=poses, robot_mask=mask, arm_joints=joints)
 
     def observer_picture(self) -> np.ndarray:
-        """Take a picture from the side, for people: uint8 (300, 400, 3) rgb."""
+        """Take the camera's picture with the whole arm, for people: uint8 (384, 384, 3) rgb."""
         if self._observer is None:
-            self._observer = Studio(OBSERVER, self.arm, links=True)
-        self._observer.use(
-            self.model, replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
+            camera = self._usual_camera.resized(OBSERVER_SIZE, OBSERVER_SIZE)
+            self._observer = Studio(camera, self.arm, links=True, samples=1)
+        self._observer.use(self.model, self._worn)
         return self._observer.render(self.data)[0]
 
     def object_poses(self) -> np.ndarray:

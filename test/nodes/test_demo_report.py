@@ -36,12 +36,12 @@ def scene(seed=7, direct=0.11, task='order2'):
         count = len(GREYS[mode])
         return Run(
             np.linspace(0.2, end, count)[:, None].repeat(2, 1),
-            [np.full((128, 160, 3), grey, np.uint8) for grey in GREYS[mode]],
+            [np.full((192, 192, 3), grey, np.uint8) for grey in GREYS[mode]],
             np.tile(START, (count, 1, 1)), [0, *[GOAL] * (count - 2)] if subgoals else
             [GOAL] * (count - 1), subgoals, 'ended <early> & well', 500.0)
     first_moved = Subgoal(np.full((32, 32, 3), 200, np.uint8), np.zeros((2, 32, 32), np.float32),
                           (np.array([GOALS[0], START[1]]) + 0.5) / 4 - 0.5, np.ones(2), 0, 1)
-    return Scene(task, seed, np.full((128, 128, 3), 30, np.uint8), START, GOALS, GOALS, (0, 1),
+    return Scene(task, seed, np.full((128, 128, 3), 30, np.uint8), START, GOALS, (0, 1),
                  {'direct': run('direct', direct), 'subgoal': run('subgoal', 0.03, first_moved)})
 
 
@@ -52,6 +52,23 @@ def test_what_a_subgoal_decides_is_read_from_where_it_shows_the_objects():
     assert replace(one, order=(1, 0)).decided(told) == '2 first'  # numbers are the right order
     last_moved = replace(told, expected_pixels=(np.array([START[0], GOALS[1]]) + 0.5) / 4 - 0.5)
     assert one.decided(last_moved) == '2 first'
+
+
+def test_all_panels_show_the_same_part_of_the_camera_view():
+    def ramp(size):
+        share = (np.mgrid[:size, :size] + 0.5).sum(0) / size / 2
+        return np.rint(255 * share[..., None].repeat(3, 2)).astype(np.uint8)
+
+    one = scene()
+    run = one.runs['subgoal']
+    run = replace(run, pictures=[ramp(192)] * 2, subgoals=[replace(
+        run.subgoals[0], image=ramp(32))])
+    one = replace(one, goal=ramp(128), runs=one.runs | {'subgoal': run})
+    left, top, side = one.window
+    assert side < 128 and (START > (left, top)).all() and (GOALS < (left + side, top + side)).all()
+    goal, subgoal, seen = (picture[-50:].astype(int) for picture in (
+        one.headed(GOAL), one.headed(0), one.seen('subgoal', -1)))
+    assert np.abs(goal - seen).max() <= 1 and np.abs(goal - subgoal).max() <= 6
 
 
 def test_rows_are_means_over_scenes_and_say_how_sure_the_gain_is():

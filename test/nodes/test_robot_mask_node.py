@@ -6,7 +6,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 from made_bags import decode_gripper
 import numpy as np
-from processes import LocalNode, Newest, NodeProcess
+from processes import LocalNode, Newest, NodeProcess, until
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
@@ -28,7 +28,7 @@ SCENE = np.random.default_rng(0).integers(0, 256, (6, 9, 3), np.uint8)
 
 @pytest.fixture(scope='module')
 def sim(tmp_path_factory):
-    """Start a simulator that shows the arm, and a view from the side."""
+    """Start a simulator that shows the arm, to people too."""
     process = NodeProcess(
         'sim_node', tmp_path_factory.mktemp('sim') / 'log.txt',
         {'lock_step': 'true', 'seed': 3, 'look': 'arm', 'observer': 'true'})
@@ -57,7 +57,7 @@ def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(sim, client):
 
 
 def test_the_simulator_tells_where_its_robot_is(sim, client):
-    image, mask, side = (Newest(client, Image, topic, STREAM) for topic in (
+    image, mask, aside = (Newest(client, Image, topic, STREAM) for topic in (
         'camera/image_raw', 'camera/robot_mask', 'observer/image_raw'))
     joints = Newest(client, JointState, 'joint_states', STREAM)
     twist = client.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
@@ -66,16 +66,18 @@ def test_the_simulator_tells_where_its_robot_is(sim, client):
     assert decode_mask(goal_mask, 'mask', (64, 64)).any()
 
     command = TwistStamped(header=image.wait(10).header)
+    assert aside.wait(10).header == command.header, 'who comes late is shown it, too'
     command.twist.linear.x = 0.05
     before = decode_gripper(joints.wait(10))
     twist.publish(command)
     then = to_nanoseconds(command.header.stamp) + round(CONTROL_PERIOD * 1e9)
     _, shown, seen, told = (
         topic.wait(10, lambda m: to_nanoseconds(m.header.stamp) == then)
-        for topic in (image, mask, side, joints))
+        for topic in (image, mask, aside, joints))
     assert set(np.unique(decode_mask(shown, 'mask', (64, 64)))) == {
         ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM}
-    assert seen.height == 300
+    assert seen.height == 384
+    assert until(lambda: image.count > 5) and aside.count == 2, 'and it is drawn once'
     angles = dict(zip(told.name, told.position, strict=True))
     gripper = UR10E.gripper_at([angles[name] for name in UR10E.joints])
     assert np.allclose(gripper, decode_gripper(told)[:3], atol=1e-6)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.camera import Camera
-from sim_bridge.world.looks import LOOKS, OBSERVER
+from sim_bridge.world.looks import LOOKS
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import KinematicsError
 from tap_ros.robots.ur10e import UR10E
@@ -90,7 +90,7 @@ def test_only_the_picture_changes_with_the_appearance():
 
 
 @pytest.mark.parametrize('camera', [
-    Camera(64, 64), OBSERVER, Camera(80, 48, tilt=0.3, fovy=50, position=(0.2, -1, 2), turn=-0.4)])
+    Camera(64, 64), Camera(80, 48, tilt=0.3, fovy=50, position=(0.2, -1, 2), turn=-0.4)])
 def test_the_camera_projects_as_mujoco_does_and_back(camera):
     spec = mujoco.MjSpec()
     spec.worldbody.add_camera(name='c', pos=camera.position, quat=camera.quaternion)
