@@ -4,7 +4,7 @@
 
 import ast
 from distutils.core import run_setup
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 import re
 import sys
@@ -89,8 +89,15 @@ def test_executables_launch_files_and_parameters_are_installed():
 
 def test_the_layout_for_recordings_shows_only_what_is_recorded():
     layout = (ROOT / 'config' / 'layouts' / 'tap_ros.json').read_text()
-    shown = set(re.findall(r'"(/[a-z_/]+)', layout))
-    assert len(shown) > 6 and shown <= {topic.recorded for topic in TOPICS}
+    shown = re.findall(r'"(imageTopic|topicPath|value)": "(/[a-z_/]+)([^"]*)', layout)
+    types = {topic.recorded: topic.type for topic in TOPICS}
+    assert len(shown) > 10
+    for kind, topic, fields in shown:
+        package, _, name = types[topic].split('/')
+        assert (name == 'Image') == (kind == 'imageTopic'), topic
+        message = getattr(import_module(f'{package}.msg'), name)()
+        for field in re.findall(r'[a-z_]+', fields):
+            message = getattr(message, field)
 
 
 def test_manifests_are_valid_and_of_one_version():
