@@ -7,7 +7,8 @@ Run the steps of the Dockerfile by chroot, where there is no docker.
 
 ROOT is a folder with a system in it that stands for the image of FROM, such as Ubuntu 24.04 of
 debootstrap with ROS 2 Jazzy, rosdep, a user `ubuntu`, and /proc and /dev mounted; the variables
-that the image would set stand in its /etc/environment. It is changed. NAME=VALUE is what --build-arg is to docker.
+that the image would set stand in its /etc/environment. It is changed. NAME=VALUE is what
+--build-arg is to docker.
 """
 
 from pathlib import Path
