@@ -5,6 +5,7 @@
 from dataclasses import dataclass, replace
 import time
 
+from experiments.bench.mppi import mppi
 from experiments.bench.rows import Row, show
 import numpy as np
 from sim_bridge.simulator import Simulator
@@ -22,6 +23,7 @@ import torch
 from torch.profiler import profile, ProfilerActivity
 
 AIM_S = 0.5  # of a plan of the preset `large`
+CALIBRATION = 6  # scenes by which other solvers get the time of CEM
 
 
 @dataclass(frozen=True)
@@ -126,35 +128,50 @@ def where_time_goes(model, seen, count=50):
 
 
 def compare_solvers(args):
-    """Return rows: what iCEM costs and finds beside CEM, in first plans of unseen scenes."""
+    """Return rows: what other solvers and fewer samples find beside CEM, in first plans."""
     default = with_preset('default')
-    ways = {'as many samples': default, 'a third of the samples': with_samples(
-        default, default.search.num_samples // 3)}
-    configs = {('cem', ''): default, **{
-        (solver, name): replace(config, solver=solver)
-        for name, config in ways.items() for solver in ('icem', 'cem')
-        if (solver, config) != ('cem', default)}}
-    planners = {key: VisualMPC.load(args.weights, config, args.device)
-                for key, config in configs.items()}
+    num_samples, few = default.search.num_samples, default.search.num_samples // 3
     simulator = Simulator('push2')
-    costs, times = ({key: [] for key in planners} for _ in range(2))
-    for seed in range(FIRST_SCENE, FIRST_SCENE + args.scenes):
-        scene, pixels = as_scene(simulator.reset(seed)), simulator.goal().object_pixels
-        for key, mpc in planners.items():
-            plan = mpc.plan(scene, mpc.goal(pixels), Memory(seed))
-            costs[key].append(plan.cost)
-            times[key].append(plan.planning_ms)
+    scenes = [(seed, as_scene(simulator.reset(seed)), simulator.goal().object_pixels)
+              for seed in range(FIRST_SCENE, FIRST_SCENE + args.scenes)]
     simulator.close()
-    base = 'cem', ''
+    third = with_samples(default, few)
+    configs = {('cem', num_samples): default, ('cem', few): third}
+    for name, solver in (('icem', 'icem'), ('mppi', mppi)):
+        # As many as fit into the time of CEM, on the line through two measurements.
+        ways = [default, *(replace(config, solver=solver) for config in (third, default))]
+        cem, low, high = (
+            np.median(times) for _, times in plans(args, ways, scenes[:CALIBRATION]))
+        equal = few + (num_samples - few) * (cem - low) / max(high - low, 0.01 * cem)
+        for count in (int(np.clip(equal, few, 2 * num_samples)), few):
+            configs[name, count] = replace(with_samples(default, count), solver=solver)
+    (costs, times), *others = plans(args, configs.values(), scenes)
     rows = []
-    for key in list(planners)[1:]:
-        more = mean_interval(np.log(np.divide(costs[key], costs[base])))
-        cost, low, high = np.exp(more)
+    for (name, count), (found, took) in zip(list(configs)[1:], others):
+        cost, low, high = np.exp(mean_interval(np.log(np.divide(found, costs))))
         rows.append(Row(
-            f'first plan, `{key[0]}`, {key[1]}', f'cost {cost:.2f} ({low:.2f} to {high:.2f}) '
-            "times `cem`'s, default preset", np.median(times[key]) / np.median(times[base]),
+            f'first plan, `{name}`, {count} samples', f'cost {cost:.2f} ({low:.2f} to {high:.2f}) '
+            f"times that of `cem`'s, {num_samples} samples", np.median(took) / np.median(times),
             "the time of `cem`'s"))
     return rows
+
+
+def plans(args, configs, scenes):
+    """
+    Plan in turns, after a plan of each to warm up.
+
+    :param scenes: (seed, Scene, goal pixels) of each.
+    :return: for each config (costs, times in ms), of every scene.
+    """
+    planners = [VisualMPC.load(args.weights, config, args.device) for config in configs]
+    found = [([], []) for _ in planners]
+    for number, (seed, scene, pixels) in enumerate((scenes[0], *scenes)):
+        for (costs, times), mpc in zip(found, planners):
+            plan = mpc.plan(scene, mpc.goal(pixels), Memory(seed))
+            if number:
+                costs.append(plan.cost)
+                times.append(plan.planning_ms)
+    return found
 
 
 def as_scene(seen):

@@ -35,7 +35,9 @@ class Row:
 
 
 def show(rows):
-    """Print rows, and return them."""
+    """Print rows, and return them; one that misses its aim has to say what limits it."""
     for row in rows:
+        if not (row.reached or row.limit):
+            raise ValueError(f'{row.what}: misses {row.aim}, and nothing says why')
         print('; '.join(filter(None, row.cells)).replace('*', ''), flush=True)
     return rows

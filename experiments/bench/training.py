@@ -18,7 +18,7 @@ from tap_ros.options import Bags
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
-from tap_ros.training.devices import pick_device, pick_precision
+from tap_ros.training.devices import has_bfloat16, pick_device, pick_precision
 import torch
 from tyro import conf
 
@@ -29,6 +29,9 @@ LADDER = (
     {'precision': 'float32', 'decoder': 'shared'},
     {'precision': 'float32', 'decoder': 'shared', 'skips': True},
     {'decoder': 'shared'}, {'decoder': 'shared', 'skips': True})
+
+SAME = 3  # the row of the ladder that is its last one in float32
+AIM = 3.2  # times the first row, of the ladder's last one where there is bfloat16
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def measure(args):
     """Return the rows of this benchmark, which it prints."""
     device = pick_device(args.device)
     torch.set_num_threads(args.threads or len(os.sched_getaffinity(0)))
-    first, rows = None, []
+    rows, efficiencies = [], []
     for row in (*LADDER, *map(method_fields, args.methods)):
         with tempfile.TemporaryDirectory() as folder:
             config = TrainingConfig(**{
@@ -86,13 +89,17 @@ def measure(args):
                 'batch_size': args.batch_size, 'device': args.device, 'threads': args.threads,
                 'save_every': 10 ** 9, **row})
             cost = time_step(config, args.steps)
-        rate, efficiency = (args.batch_size / each for each in (cost.seconds, cost.cpu_seconds))
-        first = first or efficiency
+        efficiencies.append(args.batch_size / cost.cpu_seconds)
+        ratio, aim = efficiencies[-1] / efficiencies[0], ()
+        if row is LADDER[-1] and has_bfloat16(device):
+            aim = (f'at least {AIM} times', ratio >= AIM,
+                   f'bfloat16 makes {ratio * efficiencies[0] / efficiencies[SAME]:.2f} x of it')
         network = f'{config.decoder} decoder{" with skips" * config.skips}'
         rows += show([Row(
             f'train a predictor, `{config.method}`, {network}, '
-            f'{pick_precision(config.precision, device)}', f'{rate:.0f} samples/s',
-            efficiency / first, 'the first row, by CPU time')])
+            f'{pick_precision(config.precision, device)}',
+            f'{args.batch_size / cost.seconds:.0f} samples/s', ratio,
+            'the first row, by CPU time', *aim)])
     return rows
 
 

@@ -88,6 +88,7 @@ class Client:
     :param namespace: of the nodes.
     :param timeout_s: most seconds of a call that is given no other time-out.
     :param node: rclpy Node that another thread spins, to use instead of one of its own.
+    :ivar answers: callback group of service clients.
     """
 
     def __init__(self, namespace: str = '', timeout_s: float = 20.0,
@@ -108,6 +109,7 @@ class Client:
             self._spinner.__enter__()
         self.node = node
         self._group = ReentrantCallbackGroup()
+        self.answers = self._group if self._context is None else self._spinner.answers
         self._lock = threading.RLock()
         self._made: dict[str, Any] = {}  # what was asked for so far
 
@@ -313,7 +315,7 @@ class Client:
     def _service(self, name: str) -> Any:
         kind, topic, _ = SERVICES[name]
         return self._once(topic, lambda: self.node.create_client(
-            kind, topic, qos_profile=SERVICE_QOS, callback_group=self._group))
+            kind, topic, qos_profile=SERVICE_QOS, callback_group=self.answers))
 
     def _planner(self) -> Any:
         return self._once('reach_goal', lambda: ActionClient(

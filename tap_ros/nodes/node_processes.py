@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start nodes as processes of their own, with logs, and end them all."""
 
+import os
 from pathlib import Path
 import re
 import signal
@@ -69,6 +70,12 @@ class NodeProcesses:
                 raise NodeEnded(
                     f'{name} ended with exit code {process.returncode}; the end of '
                     f'{self._log(name)}:\n' + '\n'.join(lines[-5:]))
+
+    def cpu_s(self, name: str) -> float:
+        """Return the CPU time that a node has taken so far, s; Linux tells."""
+        stat = Path(f'/proc/{self._processes[name].pid}/stat').read_text()
+        user, system = stat.rpartition(')')[2].split()[11:13]
+        return (int(user) + int(system)) / os.sysconf('SC_CLK_TCK')
 
     def wait_until_ready(self) -> str:
         """

@@ -2,15 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Services that answer whatever happens, at once or later, and errors in the log."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+import threading
 import traceback
 from typing import Any
 
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.service import Service
 from tap_ros.errors import TapError
+from tap_ros.nodes.subscriptions import PollOnlyGroup
 from tap_ros.nodes.topics import SERVICE_QOS
 from tap_ros.text import escaped
+
+WAIT_NS = 5 * 10**7  # after which a thread looks whether its node ends, or has more to wait for
 
 
 def log_error(node: Node, what: str, error: BaseException) -> None:
@@ -41,33 +49,76 @@ def answering(node: Node, callback: Callable[[Any, Any], Any]) -> Callable[[Any,
     return answer
 
 
-def create_deferred_service(node: Node, service_type: type, name: str,
-                            take: Callable[[Any, Callable[[Any], object]], object]) -> Service:
+def wait_for_some(context: Context, services: Sequence[Service] = (),
+                  clients: Sequence[Client] = ()) -> list[Service | Client]:
     """
-    Offer a service whose responses may be sent later, by any thread.
+    Wait for WAIT_NS at most; return those that have something to take.
+
+    :param services: of which no executor takes requests; clients: nor answers of these.
+    """
+    ones = (*services, *clients)
+    with ExitStack() as held:
+        for one in ones:
+            held.enter_context(one.handle)
+        wait_set = rclpy_implementation.WaitSet(
+            0, 0, 0, len(clients), len(services), 0, context.handle)
+        wait_set.clear_entities()
+        for service in services:
+            wait_set.add_service(service.handle)
+        for client in clients:
+            wait_set.add_client(client.handle)
+        wait_set.wait(WAIT_NS)
+        ready = {*wait_set.get_ready_entities('service'), *wait_set.get_ready_entities('client')}
+        return [one for one in ones if one.handle.pointer in ready]
+
+
+class DeferredService:
+    """
+    A service whose requests are taken by a thread of its own, and answered by any thread.
+
+    An executor looks at everything that its node has, three times for a request, and holds
+    Python's lock meanwhile: that took as long as a prediction.
 
     :param take: called with each request and a function that sends its response; that function
         has to be called exactly once.
-    :return: the rclpy Service.
     """
-    # An executor hands what the callback returns to send_response, together with the client's id.
-    service = node.create_service(
-        service_type, name, lambda request, response: request, qos_profile=SERVICE_QOS)
-    send = service.send_response
 
-    def take_request(request: Any, header: Any) -> None:
-        take(request, lambda response: send(response, header))
+    def __init__(self, node: Node, service_type: Any, name: str,
+                 take: Callable[[Any, Callable[[Any], object]], object]) -> None:
+        self._node, self._take = node, take
+        self._service = node.create_service(
+            service_type, name, lambda _, response: response, qos_profile=SERVICE_QOS,
+            callback_group=PollOnlyGroup())
+        self._ended = threading.Event()
+        # No daemon: Python would abort if it ended while the thread is in C++.
+        self._thread = threading.Thread(target=self._run, name=name)
 
-    service.send_response = take_request  # type: ignore[method-assign,assignment]
-    return service
+    def start(self) -> None:
+        """Begin to take requests, those that wait already among them."""
+        self._thread.start()
 
+    def close(self) -> None:
+        """End the thread, and take what still waits."""
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        while self._take_one():
+            pass
 
-def take_pending_requests(service: Service) -> None:
-    """Take the requests of a deferred service that wait after its executor has ended."""
-    with service.handle:
-        while True:
-            request, header = service.handle.service_take_request(
-                service.srv_type.Request)  # type: ignore[attr-defined]
-            if header is None:
-                return
-            service.send_response(request, header)
+    def _run(self) -> None:
+        while not self._ended.is_set() and self._node.context.ok():
+            try:
+                if wait_for_some(self._node.context, services=[self._service]):
+                    self._take_one()
+            except Exception as error:
+                if self._node.context.ok():
+                    log_error(self._node, self._service.srv_name, error)
+
+    def _take_one(self) -> bool:
+        """Take a request if one waits; return whether it did."""
+        with self._service.handle:
+            request, header = self._service.handle.service_take_request(
+                self._service.srv_type.Request)  # type: ignore[attr-defined]
+        if header is not None:
+            self._take(request, lambda response: self._service.send_response(response, header))
+        return header is not None

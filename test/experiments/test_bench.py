@@ -3,7 +3,11 @@
 """The benchmarks measure what they say."""
 
 from experiments.bench import recording
+from experiments.bench.mppi import mppi
+from experiments.bench.rows import Row, show
+import numpy as np
 import pytest
+from tap_ros.planning.protocols import Problem, SearchConfig
 
 
 def test_all_frames_are_opened_beside_another_job(monkeypatch):
@@ -15,3 +19,24 @@ def test_all_frames_are_opened_beside_another_job(monkeypatch):
     monkeypatch.setattr(recording, '_build_cache', lambda paths, scratch: 1)
     with pytest.raises(RuntimeError, match='saw 1 of'):
         recording.measure(args)
+
+
+def test_a_row_that_misses_its_aim_says_why():
+    with pytest.raises(ValueError, match='a plan: misses at most 1 s'):
+        show([Row('a plan', '2 s', 2.0, 'its predictions', 'at most 1 s', False)])
+    row, = show([Row('a plan', '2 s', 2.0, 'its predictions', 'at most 1 s', False, 'all of it')])
+    assert row.cells[-2:] == ('**missed**: at most 1 s', 'all of it')
+
+
+def test_mppi_goes_to_the_least_cost():
+    target = np.array([0.3, -0.7, 0.2])
+
+    def search(cost=lambda samples: ((samples - target) ** 2).sum(1), **changes):
+        problem = Problem(cost, np.zeros(3), np.full(3, 0.3), **changes)
+        return mppi(problem, SearchConfig(num_iterations=12), np.random.default_rng(0))
+
+    assert np.abs(search().best - target).max() < 0.05
+    assert (search(proposals=target[None]).best == target).all()
+    right = search(cost=lambda samples: np.where(samples[:, 0] > 0, np.nan, -samples[:, 0]))
+    assert right.best[0] <= 0 and np.isfinite(right.cost)
+    assert len(search(cost=lambda samples: np.full(len(samples), np.nan)).best) == 3

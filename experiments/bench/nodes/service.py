@@ -14,11 +14,13 @@ import contextlib
 from dataclasses import dataclass, field
 import multiprocessing
 import os
+from queue import SimpleQueue
 import signal
 import tempfile
 import threading
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray
 from experiments.bench.rows import Row, show
 import numpy as np
 from rclpy.qos import QoSProfile
@@ -28,13 +30,34 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.nodes.calls import call, CallError
 from tap_ros.nodes.client import Client, request_fields
 from tap_ros.nodes.node_processes import NodeProcesses
+from tap_ros.nodes.predictor.requests import MAX_TOGETHER as TOGETHER
 from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.protocol import Question
 from tap_ros.weights import DEFAULT_PREDICTOR
 
 PIXELS = np.array([[[20, 21], [40, 33]], [[30, 12], [44, 50]]], np.float32)  # start, goal
 TIMEOUT = 20.0  # s; a call that takes longer counts as lost
 MOST_PROCESSES = 4  # of clients
+
+
+@dataclass(frozen=True)
+class Latency:
+    """
+    What one client saw, in turns with the model alone; all in s.
+
+    :param alone: (rounds * calls,), the model alone.
+    :param together: (rounds * calls / TOGETHER,), it with TOGETHER questions in a batch.
+    :param service: (rounds * calls,), from the call to the answer.
+    :param inside: of these, in the model.
+    :param node: of these, in the node, after a request was decoded: median.
+    """
+
+    alone: np.ndarray
+    together: np.ndarray
+    service: np.ndarray
+    inside: np.ndarray
+    node: float
 
 
 @dataclass(frozen=True)
@@ -45,11 +68,13 @@ class Load:
     :param latencies: (answers,) s, of the calls that were answered with a prediction.
     :param per_second: of these answers.
     :param counts: of other ends: 'busy' (told to ask again), 'refused', 'lost' (no answer).
+    :param cpu_s: CPU time of the clients, for one answer.
     """
 
     latencies: np.ndarray
     per_second: float
     counts: Counter
+    cpu_s: float
 
 
 @dataclass(frozen=True)
@@ -81,23 +106,31 @@ def measure(args):
     with tempfile.TemporaryDirectory() as folder, NodeProcesses(folder) as nodes:
         nodes.start('predictor_node')
         with streaming(args.rate) as stream:
-            alone, service = (1e3 * np.percentile(times, (50, 99)) for times in compare_latency(
-                stream, args.rounds, args.calls))
+            found = compare_latency(stream, args.rounds, args.calls)
+            alone, service, inside = (1e3 * np.median(times) for times in (
+                found.alone, found.service, found.inside))
+            node = 1e3 * found.node
             rows = show([Row(
-                'answer of `/predict_subgoal`', f'{service[0]:.1f} ms, 99th percentile '
-                f'{service[1]:.1f} ms', service[0] / alone[0],
-                f'the model alone, {alone[0]:.1f} ms',
-                'at most 1.2 times the model alone and 1 ms',
-                service[0] <= 1.2 * alone[0] + 1)])
+                'answer of `/predict_subgoal`', f'{service:.1f} ms, 99th percentile '
+                f'{1e3 * np.percentile(found.service, 99):.1f} ms', service / alone,
+                f'the model alone, {alone:.1f} ms', 'at most 1.2 times the model alone and 1 ms',
+                service <= 1.2 * alone + 1, f'the model there {inside:.1f} ms, what else the node '
+                f'does {node - inside:.1f} ms, DDS and client {service - node:.1f} ms')])
+            gain = TOGETHER * np.median(found.alone) / np.median(found.together)
             first = None
             for count in args.clients:
+                spent = nodes.cpu_s('predictor_node')
                 load = measure_load(count, args.seconds)
+                spent = (nodes.cpu_s('predictor_node') - spent) / max(len(load.latencies), 1)
                 first = first or load.per_second
                 rows += show([Row(
                     f'answers to {count} clients', f'{load.per_second:.0f} a second, '
                     f'{load.counts["busy"]} told to come later, {load.counts["lost"]} lost',
                     load.per_second / first, f'{args.clients[0]} client',
-                    *(('at least 3 times', load.per_second >= 3 * first) if count == 16 else ()))])
+                    *(('at least 3 times', load.per_second >= 3 * first) if count == 16 else ()),
+                    limit=f'{TOGETHER} in a batch: {gain:.1f} x the model alone; CPU time of an '
+                    f'answer: node {1e3 * spent:.1f} ms, clients {1e3 * load.cpu_s:.1f} ms'
+                    if count == 16 else '')])
         nodes.check()
     return rows
 
@@ -109,20 +142,29 @@ def compare_latency(stream, rounds, calls):
     :param stream: process that publishes; it stands still while the model is alone.
     :param rounds: turns of each.
     :param calls: calls in each turn.
-    :return: times of the model and of the service, (rounds * calls,) each, in s.
+    :return: Latency.
     """
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
-    start, goal = pictures()
-    alone, service = [], []
+    question = Question(*pictures(), *PIXELS)
+    alone, together, service, inside = [], [], [], []
     with Client() as client:
         ask, request = make_client(client, SERVICE_QOS.depth), make_request()
+        node = SimpleQueue()  # of what /diagnostics tells
+        client.node.create_subscription(DiagnosticArray, '/diagnostics', node.put, 10)
         call(ask, request, 120)
         for _ in range(rounds):
             os.kill(stream.pid, signal.SIGSTOP)
-            alone += timed(lambda: predictor.predict(start, goal, *PIXELS), calls)
+            alone += timed(lambda: predictor.predict_together([question]), calls)
+            together += timed(lambda: predictor.predict_together([question] * TOGETHER),
+                              -(-calls // TOGETHER))
             os.kill(stream.pid, signal.SIGCONT)
-            service += timed(lambda: call(ask, request, TIMEOUT), calls)
-    return np.array(alone), np.array(service)
+            service += timed(lambda: inside.append(
+                call(ask, request, TIMEOUT).model_time_ms / 1e3), calls)
+        while not node.empty():
+            node.get()
+        values = {one.key: one.value for one in node.get(timeout=TIMEOUT).status[0].values}
+    return Latency(*map(np.array, (alone, together, service, inside)),
+                   float(values['predict_subgoal p50_ms']) / 1e3)
 
 
 def timed(work, count, warm_up=5):
@@ -156,7 +198,8 @@ def measure_load(clients, seconds, depth=SERVICE_QOS.depth):
         process.join()
     latencies = np.concatenate([part[0] for part in found])
     return Load(latencies, len(latencies) / max(part[2] for part in found),
-                sum((part[1] for part in found), Counter()))
+                sum((part[1] for part in found), Counter()),
+                sum(part[3] for part in found) / max(len(latencies), 1))
 
 
 def ask_many(clients, seconds, depth, barrier, results):
@@ -167,7 +210,7 @@ def ask_many(clients, seconds, depth, barrier, results):
     :param seconds: how long to ask.
     :param depth: answers that wait in the queue of a client.
     :param barrier: passed when all processes are ready.
-    :param results: queue for (latencies, counts of other ends, s that it took).
+    :param results: queue for (latencies, counts of other ends, s that it took, s of CPU time).
     """
     latencies, others = [], []
 
@@ -190,19 +233,21 @@ def ask_many(clients, seconds, depth, barrier, results):
         for one in each:
             call(one, make_request(), 120)
         barrier.wait(300)
-        begin = time.monotonic()
+        begin, spent = time.monotonic(), time.process_time()
         threads = [threading.Thread(target=ask, args=(one, begin + seconds)) for one in each]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        results.put((np.array(latencies), Counter(others), time.monotonic() - begin))
+        results.put((np.array(latencies), Counter(others), time.monotonic() - begin,
+                     time.process_time() - spent))
 
 
 def make_client(client, depth):
     """Return a further rclpy client of the predictor, with a queue of its own."""
     return client.node.create_client(
-        PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth))
+        PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth),
+        callback_group=client.answers)
 
 
 @contextlib.contextmanager

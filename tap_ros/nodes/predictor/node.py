@@ -41,8 +41,8 @@ class PredictorNode(LifecycleBase):
     """
     Offers the service only once the weights are loaded, checked and warmed up.
 
-    Without autostart it offers the service at once, and refuses requests until it is active. The
-    executor takes and checks the requests; one thread predicts what waits together, and sends the
+    Without autostart it offers the service at once, and refuses requests until it is active. One
+    thread takes and checks the requests; another predicts what waits together, and sends the
     answers.
     """
 
@@ -65,15 +65,16 @@ class PredictorNode(LifecycleBase):
         self._unshown: deque[
             tuple[requests.PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
         steady_timer(self, SHOW_PERIOD, self._on_timer)
-        self._service = services.create_deferred_service(
+        self._service = services.DeferredService(
             self, PredictSubgoal, 'predict_subgoal', self._on_request)
         self.autostart('activate')
+        self._service.start()
 
     def close(self) -> None:
         """Refuse all waiting requests, and let the running batch end."""
         if self._queue is not None:
             self._queue.close()
-        services.take_pending_requests(self._service)  # each is refused: the node is ending
+        self._service.close()  # what waits is refused: the node is ending
         self._show()
 
     # Lifecycle
@@ -106,18 +107,21 @@ class PredictorNode(LifecycleBase):
         """Return the file of the weights."""
         return predictor_files(self.params['weights'])
 
-    # In the executor
+    # In the thread of the service
 
     def _on_request(self, request: PredictSubgoal.Request, send: Send) -> None:
         """Check a request and put it into the queue, or refuse it."""
         begin = time.perf_counter()
+        queue, predictor = self._queue, self._predictor
         try:
-            if not self.active or self._queue is None or self._predictor is None:
+            if not self.active or queue is None or predictor is None:
                 raise ConfigError(self.why_not())
-            task = self._reader.read(request, self._predictor)
-            self._queue.put(task, lambda found: self._answer(task, found, send, begin))
+            task = self._reader.read(request, predictor)
+            queue.put(task, lambda found: self._answer(task, found, send, begin))
         except Exception as error:
             self._send(send, self._refusal(error))
+
+    # In the executor
 
     def _on_timer(self) -> None:
         """Publish a new subgoal, and take messages so that diagnostics have their age and rate."""
@@ -158,7 +162,7 @@ class PredictorNode(LifecycleBase):
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         self._unshown.append(shown)
 
-    # In either
+    # In any of them
 
     def _refusal(self, error: Exception) -> Any:
         """Return the response that names an error, and log it."""
