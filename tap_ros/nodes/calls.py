@@ -74,7 +74,7 @@ class Spinner:
                 self._stop.wait(POLL_S)
                 continue
             with suppress(InvalidHandle):  # of one that was destroyed just now
-                for client in wait_for_some(self._node.context, clients=clients):
+                for client in wait_for_some(self._node.context, clients):
                     header, answer = client.handle.take_response(client.srv_type.Response)
                     if header is not None:
                         with suppress(KeyError):  # given up

@@ -12,7 +12,6 @@ from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.service import Service
 from tap_ros.errors import TapError
 from tap_ros.nodes.subscriptions import PollOnlyGroup
 from tap_ros.nodes.topics import SERVICE_QOS
@@ -49,24 +48,22 @@ def answering(node: Node, callback: Callable[[Any, Any], Any]) -> Callable[[Any,
     return answer
 
 
-def wait_for_some(context: Context, services: Sequence[Service] = (),
-                  clients: Sequence[Client] = ()) -> list[Service | Client]:
+def wait_for_some(context: Context, ones: Sequence[Any]) -> list[Any]:
     """
     Wait for WAIT_NS at most; return those that have something to take.
 
-    :param services: of which no executor takes requests; clients: nor answers of these.
+    :param ones: rclpy Services and Clients that no executor waits for.
     """
-    ones = (*services, *clients)
+    clients = sum(isinstance(one, Client) for one in ones)
     with ExitStack() as held:
         for one in ones:
             held.enter_context(one.handle)
         wait_set = rclpy_implementation.WaitSet(
-            0, 0, 0, len(clients), len(services), 0, context.handle)
+            0, 0, 0, clients, len(ones) - clients, 0, context.handle)
         wait_set.clear_entities()
-        for service in services:
-            wait_set.add_service(service.handle)
-        for client in clients:
-            wait_set.add_client(client.handle)
+        for one in ones:
+            add = wait_set.add_client if isinstance(one, Client) else wait_set.add_service
+            add(one.handle)
         wait_set.wait(WAIT_NS)
         ready = {*wait_set.get_ready_entities('service'), *wait_set.get_ready_entities('client')}
         return [one for one in ones if one.handle.pointer in ready]
@@ -108,7 +105,7 @@ class DeferredService:
     def _run(self) -> None:
         while not self._ended.is_set() and self._node.context.ok():
             try:
-                if wait_for_some(self._node.context, services=[self._service]):
+                if wait_for_some(self._node.context, [self._service]):
                     self._take_one()
             except Exception as error:
                 if self._node.context.ok():
