@@ -151,7 +151,7 @@ def compare_solvers(args):
         cost, low, high = np.exp(mean_interval(np.log(np.divide(found, costs))))
         rows.append(Row(
             f'first plan, `{name}`, {count} samples', f'cost {cost:.2f} ({low:.2f} to {high:.2f}) '
-            f"times that of `cem`'s, {num_samples} samples", np.median(took) / np.median(times),
+            f'times that of `cem`, {num_samples} samples', np.median(took) / np.median(times),
             "the time of `cem`'s"))
     return rows
 
