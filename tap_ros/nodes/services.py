@@ -110,6 +110,7 @@ class DeferredService:
             except Exception as error:
                 if self._node.context.ok():
                     log_error(self._node, self._service.srv_name, error)
+                    self._ended.wait(1)  # whatever it is, it may last
 
     def _take_one(self) -> bool:
         """Take a request if one waits; return whether it did."""
