@@ -11,6 +11,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 import numpy as np
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.timer import Timer
 from sim_bridge.ros.publishers import ScenePublishers
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
 from sim_bridge.world_protocol import ability, make_world, Observation, World
@@ -33,7 +34,6 @@ from tap_ros.robots.arm import DEFAULT_ARM
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
-RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
 COMMAND_TIMEOUT, MAX_TIMEOUT = 1.0, 60.0  # s that a command is valid, unless its sender says so
 MAX_PERIODS = 100  # of a call that is answered when they have passed: about a second
 OPTIONS = {'look': DEFAULT_LOOK, 'appearance': 'usual', 'arm': DEFAULT_ARM}  # if taken
@@ -45,8 +45,8 @@ class SimNode(Node):
     Steps and renders in the thread that spins, to which the OpenGL context belongs.
 
     Lock-step: a command stamped like the newest image, or unstamped, lets one control period pass.
-    Meanwhile the newest image, and what belongs to it, is sent again every RESEND_S with the same
-    stamp, for nodes that start late.
+    Meanwhile the newest image, and what belongs to it, is sent again every resend_period with the
+    same stamp, for nodes that start late.
     Real time: a timer does, with the command that came since the last period, else standing still.
     A command is valid for COMMAND_TIMEOUT, or what arm/command_timeout says, after it came; later
     the arm stands still.
@@ -86,6 +86,7 @@ class SimNode(Node):
             (Float64, 'arm/command_timeout', self._on_timeout, LATCHED)]
         for subscription in subscriptions:
             self.create_subscription(*subscription)
+        self._resend: Timer | None = None
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
                                    (SetGoal, 'sim/set_goal', self._on_set_goal),
@@ -94,7 +95,8 @@ class SimNode(Node):
             self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
         if self.params['lock_step']:
             mode = 'lock-step'
-            steady_timer(self, RESEND_S, self._topics.send_newest)
+            self._resend = steady_timer(
+                self, self.params['resend_period'], self._topics.send_newest)
         else:
             factor = self.params['real_time_factor']
             steady_timer(self, CONTROL_PERIOD / factor, self._on_timer)
@@ -291,6 +293,8 @@ class SimNode(Node):
         if self._hide_arm:
             observation = self._sim.observe(hide_arm=True)
         self._topics.moment(self._sim, observation, to_stamp(self._stamp_ns))
+        if self._resend is not None:
+            self._resend.reset()
 
     def _publish_goal(self) -> None:
         # Each goal has a stamp of its own, also where no time has passed since the last one.
@@ -333,6 +337,10 @@ def declare_parameters(node: Node) -> Parameters:
         'lock_step', False,
         'True: each twist command lets one control period pass, so that runs repeat exactly. '
         'False: time passes by itself.')
+    parameters.declare(
+        'resend_period', 0.2,
+        'Seconds after which, in lock-step, the newest picture is sent again.',
+        low=0.02, high=10.0)
     parameters.declare('real_time_factor', 1.0,
                        'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
     return parameters

@@ -16,6 +16,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
 from tap_ros.contract import NODE_CLASSES
 from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE_TYPE, TOPICS
 from tap_ros.text import escaped, listing
@@ -115,10 +116,10 @@ def adapt_regularly(node: Node, subscriptions: Iterable[AdaptiveSubscription],
 
 
 def steady_timer(node: Node, period_s: float, callback: Callable[[], object],
-                 callback_group: CallbackGroup | None = None) -> None:
+                 callback_group: CallbackGroup | None = None) -> Timer:
     """Call something regularly, also where /clock stands still."""
-    node.create_timer(period_s, callback, callback_group,
-                      clock=Clock(clock_type=ClockType.STEADY_TIME))
+    return node.create_timer(period_s, callback, callback_group,
+                             clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, dict[bytes, str]]:

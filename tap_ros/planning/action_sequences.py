@@ -14,6 +14,7 @@ and pushes it through.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -234,14 +235,14 @@ def _go_and_push(shape: SequenceShape, gripper: np.ndarray, start: np.ndarray, e
     if not (gripper[2] < 0.05 and 0.02 < ahead < 0.2 and beside < 0.05):
         # as many lifted periods as the way needs at nearly full speed
         for lifted, phase in LIFTS:
-            periods = _moving_periods(shape, gripper, lifted, phase)
+            periods = _moving_periods(shape, gripper[2], lifted, phase)
             if np.abs(start - here).max() <= PACE * shape.move_limit * periods[:lifted].sum():
                 break
     start = start if lifted else here
     needed = np.linalg.norm(end - start) / (PACE * shape.push_limit)
     if not lifted:
         phase = int(-np.ceil(needed) % REPEAT)  # so that it ends with a segment
-    periods = _moving_periods(shape, gripper, lifted, phase)
+    periods = _moving_periods(shape, gripper[2], lifted, phase)
     moves = np.zeros((MOVES, 2))
     moves[:lifted] = (start - here) / max(1, periods[:lifted].sum())
     last = lifted + 1
@@ -252,8 +253,8 @@ def _go_and_push(shape: SequenceShape, gripper: np.ndarray, start: np.ndarray, e
     return join(moves, lifted, phase)
 
 
-def _moving_periods(shape: SequenceShape, gripper: np.ndarray, lifted: int,
-                    phase: int) -> np.ndarray:
+@lru_cache(100)
+def _moving_periods(shape: SequenceShape, height: float, lifted: int, phase: int) -> np.ndarray:
     """Return how many control periods of each segment (num_moves,) move sideways."""
-    _, (sideways,) = shape.climbs(np.array([lifted]), np.array([phase]), gripper[2])
+    _, (sideways,) = shape.climbs(np.array([lifted]), np.array([phase]), height)
     return np.bincount(segments([phase])[0], sideways, minlength=MOVES)

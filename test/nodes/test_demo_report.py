@@ -88,7 +88,8 @@ def test_rows_are_means_over_scenes_and_say_how_sure_the_gain_is():
 
 def test_the_page_is_one_file_with_everything_inside(tmp_path):
     path, scenes = tmp_path / 'report.html', [scene(), scene(7, 0.03, '<order3>')]
-    write_report(path, scenes, shown(scenes), 'made by a test', {'command': 'a <b>'})
+    films = {caption: film(one) for caption, one in shown(scenes).items()}
+    write_report(path, scenes, films, 'made by a test', {'command': 'a <b>'})
     page = path.read_text()
     assert '<dt>command</dt><dd>a &lt;b&gt;</dd>' in page
     assert re.findall('<th scope="row">(.*?)</th>', page) == ['order2', '&lt;order3&gt;',

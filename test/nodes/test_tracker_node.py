@@ -3,13 +3,14 @@
 """tracker_node: objects of the stamp of each picture after a click on each, or the reason."""
 
 import json
+import time
 
 from driven import SEED, select
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from processes import LocalNode, Newest, NodeProcess, until
 import pytest
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, JointState
 from tap_msgs.msg import ObjectStates
 import tap_ros
 from tap_ros.contract import CONTROL_PERIOD
@@ -18,7 +19,7 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import positions_of
 from tap_ros.nodes.explorer.node import ExplorerNode
-from tap_ros.nodes.ros_messages import encode_image
+from tap_ros.nodes.ros_messages import encode_image, encode_joints
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.nodes.tracker.node import TrackerNode
 from websockets.sync.client import connect
@@ -121,6 +122,35 @@ def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(
             scene.client.call('select', **asked)
     _, names, _ = scene.at('objects', scene.move(0.0, 0.0, 0.01))
     assert set(names) == set(clicks)
+
+
+def test_a_picture_waits_for_its_joints_as_long_as_it_is_told_to(client):
+    node = LocalNode(TrackerNode, '/late', robot_mask='none', patience=60.0)
+    images, joints = (client.create_publisher(kind, f'/late/{topic}', STREAM) for kind, topic in (
+        (Image, 'camera/image_raw'), (JointState, 'joint_states')))
+    followed = Newest(client, ObjectStates, '/late/objects', STREAM)
+    picture = np.full((SIZE, SIZE, 3), 90, np.uint8)
+    picture[40:60, 50:80] = 200, 40, 40
+
+    def send(kind, second):
+        stamp = to_stamp(second * 10**9)
+        kind.publish(encode_image(picture, stamp, 'eye') if kind is images else
+                     encode_joints(np.zeros(4), stamp, 'world'))
+
+    try:
+        assert until(lambda: images.get_subscription_count() and joints.get_subscription_count())
+        send(joints, 1)
+        send(images, 1)
+        with tap_ros.Client('/late') as user:
+            select(user, {'red': (65, 50)})
+        followed.wait(10)
+        send(images, 2)
+        time.sleep(1)
+        assert followed.count == 1
+        send(joints, 2)
+        followed.wait(10, lambda m: m.header.stamp.sec == 2)
+    finally:
+        assert node.end() == 0
 
 
 def test_another_scene_or_camera_ends_the_selection(scene, client):

@@ -11,6 +11,7 @@ The objects are tracked: a click on each in the first picture, here at its true 
 in the goal picture on what is not found there. Ground truth only measures, and draws for people.
 """
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 import os
 from pathlib import Path
@@ -26,9 +27,17 @@ from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.contract import ROBOT_MASKS, step_budget
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.files import free_folder
-from tap_ros.nodes.demo.film import Scene
-from tap_ros.nodes.demo.lane import Refused, run_scenes
-from tap_ros.nodes.demo.report import MODES, results_table, shown, summary, write_report
+from tap_ros.nodes.demo.film import film, Scene
+from tap_ros.nodes.demo.lane import run_scenes
+from tap_ros.nodes.demo.report import (
+    gains,
+    MODES,
+    results_table,
+    shown,
+    summary,
+    write_report,
+)
+from tap_ros.nodes.demo.watch import Refused
 from tap_ros.options import Folder, one_of
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
@@ -124,22 +133,26 @@ def run(args: Options) -> int:
     folder = new_folder(args.out)
     print(f'starting nodes; their logs are in {folder / "logs"}', flush=True)
     begin, scenes = time.monotonic(), list[Scene]()
-    left_out = list[str]()
-    for (task, seed), scene in zip(args.plan, run_scenes(args, folder)):
-        if isinstance(scene, Refused):
-            left_out.append(f'{task} {seed}')
-            print(f'  {task} {seed}   left out: {scene}', flush=True)
-            continue
-        scenes.append(scene)
-        print(f'  {scene.task} {scene.seed}   ' + '   '.join(
-            f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps'
-            for mode, name in MODES.items() for run in [scene.runs[mode]]), flush=True)
+    left_out, drawn = list[str](), dict[str, Future[bytes]]()
+    with ThreadPoolExecutor(1) as pool:
+        for (task, seed), scene in zip(args.plan, run_scenes(args, folder, drawn)):
+            if isinstance(scene, Refused):
+                left_out.append(f'{task} {seed}')
+                print(f'  {task} {seed}   left out: {scene}', flush=True)
+                continue
+            scenes.append(scene)
+            if task not in drawn and gains(scene):
+                drawn[task] = pool.submit(film, scene)
+            print(f'  {task} {seed}   ' + '   '.join(
+                f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps'
+                for mode, name in MODES.items() for run in [scene.runs[mode]]), flush=True)
     if not scenes:
         raise TapError('no scene could be run')
-    films = shown(scenes)
-    for (task, _), film in zip(dict(args.plan).items(), films.values()):
-        (folder / f'{task}.webp').write_bytes(film)
-        print(f'film       {folder / task}.webp')
+    films = {}
+    for caption, scene in shown(scenes).items():
+        films[caption] = drawn[scene.task].result() if scene.task in drawn else film(scene)
+        (folder / f'{scene.task}.webp').write_bytes(films[caption])
+        print(f'film       {folder / scene.task}.webp')
     write_report(
         folder / 'report.html', scenes, films,
         f'Scenes from seed {args.seed} on, which are in no recording, training or table. Left '

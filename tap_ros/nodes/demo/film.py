@@ -30,7 +30,8 @@ class Run:
     """One attempt at a scene: T steps, K objects."""
 
     distances: np.ndarray  # (T + 1, K) metres from each object to its goal
-    pictures: Sequence[np.ndarray]  # (H, W, 3) uint8: T + 1 of them, of the camera's view
+    # uint8 (H, W, 3) of the camera's view: T + 1 with the arm, or the first and last without
+    pictures: Sequence[np.ndarray]
     pixels: np.ndarray  # (T + 1, K, 2) of the objects, in pixels of the goal picture
     heading: Sequence[int]  # (T,) which subgoal it heads for, or GOAL
     subgoals: Sequence[Subgoal]  # in turn
@@ -43,7 +44,7 @@ class Run:
 
     def begun_at(self, t: int) -> int:
         """Return since which step it has headed for what it does after t steps."""
-        return next(i for i in range(t + 1) if self.heading_at(i) == self.heading_at(t))
+        return next(i for i in range(len(self.pixels)) if self.heading_at(i) == self.heading_at(t))
 
     @property
     def reached(self) -> bool:
@@ -104,9 +105,8 @@ class Scene:
         return self._mark(subgoal.image, expected, self.start_pixels, expected)
 
     def seen(self, mode: str, t: int) -> np.ndarray:
-        """Draw what was seen of a run after t steps, -1: all, and where it pushes the objects."""
+        """Draw what was seen of a run after t steps, -1: in the end, and what it pushes where."""
         run = self.runs[mode]
-        t %= len(run.pictures)
         heading = run.heading_at(t)
         ends = self.goal_pixels if heading == GOAL else self._expected(run.subgoals[heading])
         return self._mark(run.pictures[t], run.pixels[t], run.pixels[run.begun_at(t)], ends)

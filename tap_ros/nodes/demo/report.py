@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 from tap_ros.evaluation.intervals import Interval, mean_interval
 from tap_ros.files import write_atomically
-from tap_ros.nodes.demo.film import film, Scene
+from tap_ros.nodes.demo.film import Scene
 
 MODES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
 
@@ -94,19 +94,19 @@ def write_report(path: str | Path, scenes: Sequence[Scene], films: Mapping[str, 
         scenes=[(f'{scene.task} {scene.seed}', list(_stills(scene))) for scene in scenes]))
 
 
-def shown(scenes: Sequence[Scene]) -> dict[str, bytes]:
+def shown(scenes: Sequence[Scene]) -> dict[str, Scene]:
     """
-    Return a film of each task, by its caption.
+    Return of which scene of each task a film is shown, by its caption.
 
-    Shown is the first scene that succeeds via the subgoal alone, the first of all if none does.
+    It is the first one that succeeds via the subgoal alone, the first of all if none does.
     """
-    films = {}
+    found = {}
     for task, group in groupby(scenes, lambda scene: scene.task):
         first, *others = group
         scene = next((one for one in (first, *others) if gains(one)), first)
-        films[f'{task} {scene.seed}: the first scene of this task that succeeds only via the '
-              'subgoal' if gains(scene) else f'{task} {scene.seed}: the first scene'] = film(scene)
-    return films
+        found[f'{task} {scene.seed}: the first scene of this task that succeeds only via the '
+              'subgoal' if gains(scene) else f'{task} {scene.seed}: the first scene'] = scene
+    return found
 
 
 def gains(scene: Scene) -> bool:

@@ -43,8 +43,6 @@ from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, Tracker, Vie
 from tap_ros.tracking.registration import propose
 from tap_ros.training.robot_mask import hidden_pixels
 
-PATIENCE_S = 0.1  # s that the joints of a picture, or the robot mask of a goal, may come after it
-
 
 @dataclass(frozen=True)
 class Selection:
@@ -315,7 +313,7 @@ class TrackerNode(Node):
             return
         view = self._view(moment)
         if (view.gripper is None and self._gripper.received > -math.inf
-                and time.monotonic() - moment.received < PATIENCE_S):
+                and time.monotonic() - moment.received < self.params['patience']):
             return  # its joints may come
         begin = time.perf_counter()
         tracked = selection.tracker.update(view)
@@ -334,7 +332,7 @@ class TrackerNode(Node):
         if goal is None or goal.stamp_ns == selection.goal_ns:
             return
         masked = self.params['robot_mask'] != 'none' and 'mask' not in goal.messages
-        if masked and time.monotonic() - goal.received < PATIENCE_S:
+        if masked and time.monotonic() - goal.received < self.params['patience']:
             return  # its mask may come
         self._selection = replace(selection, goal_ns=goal.stamp_ns)
         header = goal.messages['image'].header
@@ -418,4 +416,6 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('max_silence', 0.35,
                        'Seconds; of a picture without joint states nearer to it than this the '
                        'gripper is not known.', low=0.05, high=60.0, read_only=False)
+    parameters.declare('patience', 0.1, 'Seconds that the joints of a picture, or the robot mask '
+                       'of a goal, are waited for.', low=0.0, high=60.0)
     return parameters
