@@ -74,7 +74,7 @@ class DeferredService:
     A service whose requests are taken by a thread of its own, and answered by any thread.
 
     An executor looks at everything that its node has, three times for a request, and holds
-    Python's lock meanwhile: that took as long as a prediction.
+    Python's lock meanwhile.
 
     :param take: called with each request and a function that sends its response; that function
         has to be called exactly once.
