@@ -4,8 +4,10 @@
 
 from dataclasses import replace
 import io
+from pathlib import Path
 import re
 
+from mcap.reader import make_reader
 import numpy as np
 from PIL import Image, ImageSequence
 import pytest
@@ -26,6 +28,7 @@ from tap_ros.nodes.demo.film import (
 from tap_ros.nodes.demo.report import gains, results_table, shown, summary, write_report
 from tap_ros.recording.cache import open_recordings
 
+LAYOUT = Path(__file__).parents[2] / 'config' / 'layouts' / 'tap_ros.json'
 GREYS = {'direct': (0, 60, 120, 180), 'subgoal': (240, 90)}  # one run is shorter
 START, GOALS = np.array([[20.0, 40.0], [90.0, 40.0]]), np.array([[20.0, 100.0], [20.0, 40.0]])
 
@@ -120,6 +123,11 @@ def test_real_nodes_push_tracked_objects_of_two_tasks_with_one_start(tmp_path, c
     assert ends == ['push2', 'order2']
     assert {path.name for path in (tmp_path / 'demo').iterdir()} == {
         'logs', 'recording', 'push2.webp', 'order2.webp', 'report.html'}
+    with (tmp_path / 'demo' / 'recording' / 'recording_0.mcap').open('rb') as file:
+        bag = make_reader(file).get_summary()
+    recorded = {bag.channels[each].topic for each in bag.statistics.channel_message_counts}
+    wanted = set(re.findall(r'": "(/[a-z_/]+)', LAYOUT.read_text()))
+    assert len(wanted) > 6 and wanted <= recorded, 'a panel would stay empty'
 
 
 @pytest.mark.slow
