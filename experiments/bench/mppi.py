@@ -8,7 +8,7 @@ Unlike cem.py, all samples count, each by its cost, the deviation stays, and the
 
 import numpy as np
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
-from tap_ros.planning.solvers.cem import judged_once_more
+from tap_ros.planning.solvers.cem import judged_once_more, proposed
 from tap_ros.search import cross_entropy, finite
 
 TEMPERATURE = 0.1  # in distances from the least cost to the median
@@ -20,10 +20,9 @@ def mppi(problem: Problem, config: SearchConfig, rng: np.random.Generator) -> So
 
     def draw(elites: np.ndarray | None) -> np.ndarray:
         samples = mean + problem.std * rng.standard_normal((config.num_samples, len(mean)))
-        if elites is None and problem.proposals is not None and len(problem.proposals):
-            samples[-len(problem.proposals):] = problem.proposals[-config.num_samples:]
-        elif elites is not None:
-            samples[-1] = mean
+        if elites is None:
+            return problem.clip(proposed(problem, samples))
+        samples[-1] = mean
         return problem.clip(samples)
 
     def cost(samples: np.ndarray) -> np.ndarray:

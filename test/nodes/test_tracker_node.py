@@ -3,6 +3,7 @@
 """tracker_node: objects of the stamp of each picture after a click on each, or the reason."""
 
 import json
+from threading import Event
 import time
 
 from driven import SEED, select
@@ -11,7 +12,7 @@ import numpy as np
 from processes import LocalNode, Newest, NodeProcess, until
 import pytest
 from sensor_msgs.msg import Image, JointState
-from tap_msgs.msg import ObjectStates
+from tap_msgs.msg import Episode, ObjectStates
 import tap_ros
 from tap_ros.contract import CONTROL_PERIOD
 from tap_ros.messages.objects import decode_objects
@@ -151,6 +152,42 @@ def test_a_picture_waits_for_its_joints_as_long_as_it_is_told_to(client):
         followed.wait(10, lambda m: m.header.stamp.sec == 2)
     finally:
         assert node.end() == 0
+
+
+def test_what_is_searched_in_a_goal_is_not_told_if_a_scene_begins_meanwhile(client):
+    node = LocalNode(TrackerNode, '/searching', robot_mask='none')
+    images, goals, marks = (
+        client.create_publisher(kind, f'/searching/{topic}', qos) for kind, topic, qos in (
+            (Image, 'camera/image_raw', STREAM), (Image, 'goal/image', LATCHED),
+            (Episode, 'episode', STREAM)))
+    told, searching = [], Event()
+    client.create_subscription(ObjectStates, '/searching/goal/objects', told.append, LATCHED)
+    picture = np.full((SIZE, SIZE, 3), 90, np.uint8)
+    picture[40:60, 50:80] = 200, 40, 40
+
+    def slow(view):
+        searching.set()
+        until(lambda: node.node._begun[0] == 5 * 10**9, 5)
+        return find(view)
+
+    try:
+        assert until(lambda: images.get_subscription_count() and marks.get_subscription_count())
+        images.publish(encode_image(picture, to_stamp(10**9), 'eye'))
+        goals.publish(encode_image(picture, to_stamp(10**9), 'eye'))
+        with tap_ros.Client('/searching') as user:
+            select(user, {'red': (65, 50)})
+        assert until(lambda: told and told[-1].objects)
+        find = node.node._selection.tracker.find
+        node.node._selection.tracker.find = slow
+        goals.publish(encode_image(picture, to_stamp(5 * 10**9), 'eye'))
+        assert searching.wait(10)
+        mark = Episode(event=Episode.START)
+        mark.header.stamp = to_stamp(5 * 10**9)
+        marks.publish(mark)
+        assert until(lambda: not told[-1].objects)
+    finally:
+        assert node.end() == 0
+    assert {one.header.stamp.sec for one in told} == {1}
 
 
 def test_another_scene_or_camera_ends_the_selection(scene, client):

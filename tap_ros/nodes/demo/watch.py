@@ -67,10 +67,15 @@ class Watch:
         for kept in self._kept.values():
             kept.clear()
 
-    def at(self, topic: str, stamp_ns: int, timeout_s: float = 0.0) -> Any | None:
-        """Return the message of a stamp, None where it does not come in time."""
-        self.until(lambda: stamp_ns in self._kept[topic], timeout_s)
-        return self._kept[topic].get(stamp_ns)
+    def at(self, topic: str, stamp_ns: int, timeout_s: float = 0.0,
+           accept: Callable[[Any], object] = lambda _: True) -> Any | None:
+        """Return the message of a stamp, None where none that is accepted comes in time."""
+        def found() -> Any | None:
+            message = self._kept[topic].get(stamp_ns)
+            return message if message is not None and accept(message) else None
+
+        self.until(lambda: found() is not None, timeout_s)
+        return found()
 
     def since(self, first_ns: int, count: int, *topics: str) -> list[tuple[Any, ...]]:
         """Return the first messages on all of some topics from a stamp on, in their order."""
@@ -114,7 +119,7 @@ def click(client: Client, watch: Watch, seed: int, start: View,
     while found is None:
         try:  # right after a reset the tracker may not have heard of the scene yet
             client.select(dict(zip(names, nearest_free(places, hidden).tolist())))
-            found = watch.at('goal/objects', goal.stamp_ns, FOUND_S)
+            found = watch.at('goal/objects', goal.stamp_ns, FOUND_S, lambda one: one.objects)
         except CallError as error:
             if 'click on an object' in str(error):
                 tries += 1

@@ -80,7 +80,7 @@ class TrackerNode(Node):
         self._info: CameraInfo | None = None
         self._told: PoseStamped | None = None  # where the camera is
         self._begun = 0, 0  # stamp at which the newest scene known of began; jumps until then
-        self._told_goal = False  # goal/objects has objects
+        self._told_goal: int | None = None  # stamp of the goal whose objects were told
         self._gripper = GripperHistory(
             declared_arm(self.params), self.params['joint_prefix'], self.params['fixed_opening'])
         camera = camera_topics(self.params)
@@ -139,10 +139,10 @@ class TrackerNode(Node):
     def _on_episode(self, message: Episode) -> None:
         if message.event != Episode.START:
             return
-        begun_ns = to_nanoseconds(message.header.stamp)
+        # Known at once to who holds the lock, and searches a picture.
+        self._begun = to_nanoseconds(message.header.stamp), self._sensors.jumps
         with self._lock:
-            self._begun = begun_ns, self._sensors.jumps
-            if self._selection is not None and begun_ns > self._selection.selected_ns:
+            if self._selection is not None and self._ended(self._selection):
                 self._forget('a new episode has begun')
 
     def _on_select(self, request: SelectObjects.Request,
@@ -329,7 +329,7 @@ class TrackerNode(Node):
     def _look_at_goal(self, selection: Selection) -> None:
         """Find the objects in the goal picture, if that is another one."""
         goal = self._goals.newest('image')
-        if goal is None or goal.stamp_ns == selection.goal_ns:
+        if goal is None or goal.stamp_ns == selection.goal_ns or self._ended(selection):
             return
         masked = self.params['robot_mask'] != 'none' and 'mask' not in goal.messages
         if masked and time.monotonic() - goal.received < self.params['patience']:
@@ -346,17 +346,24 @@ class TrackerNode(Node):
             self._goal_objects.publish(ObjectStates(header=header))  # not those of another goal
             raise
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'find')
+        if self._ended(selection):
+            return  # it may have been the goal of the scene that has begun
         lost = np.array(found.states) == LOST
         # What is not found is to be placed, beginning where it is now.
         pixels = np.where(lost[:, None], selection.tracked.pixels, found.pixels)
         message = self._encode(
             selection.names, replace(found, pixels=pixels), selection.plane, header)
         self._goal_objects.publish(message)
-        self._told_goal = True
+        self._told_goal = goal.stamp_ns
         if lost.any():
             missing = listing([selection.names[k] for k in np.flatnonzero(lost)])
             self.get_logger().warning(f'goal/image: {missing} not found: place it, in the '
                                       'explorer or by goal_objects of reach_goal')
+
+    def _ended(self, selection: Selection) -> bool:
+        """Return whether another episode has begun since a selection."""
+        begun_ns, jumps = self._begun
+        return begun_ns > selection.selected_ns and jumps == selection.jumps
 
     def _other_scene(self, selection: Selection) -> str:
         """Say in what way the camera shows another scene than that of a selection, '' if not."""
@@ -366,13 +373,11 @@ class TrackerNode(Node):
 
     def _forget(self, why: str) -> None:
         """Follow nothing any more."""
-        assert self._selection is not None
-        none = encode_objects((), np.empty((0, 2)), None, self._selection.goal_ns or 0, '',
-                              ObjectStates.SOURCE_TRACKED)
         self._selection = None
-        if self._told_goal:
-            self._goal_objects.publish(none)
-            self._told_goal = False
+        if self._told_goal is not None:
+            self._goal_objects.publish(encode_objects(
+                (), np.empty((0, 2)), None, self._told_goal, '', ObjectStates.SOURCE_TRACKED))
+            self._told_goal = None
         self.get_logger().warning(
             f'the selected objects are forgotten: {why}; select them again')
 

@@ -12,19 +12,23 @@ def cem(problem: Problem, config: SearchConfig, rng: np.random.Generator) -> Sol
     Draw from a Gaussian with diagonal covariance, refit mean and deviation to the elites, repeat.
 
     With fewer elites than dimensions a full covariance has not full rank, which is why the
-    diagonal is refitted. Proposals replace the last samples of the first iteration; if they are
-    too many, the last of them count.
+    diagonal is refitted.
     """
     def draw(elites: np.ndarray | None) -> np.ndarray:
         mean, std = (problem.mean, problem.std) if elites is None else (
             elites.mean(0), elites.std(0))
         samples = mean + std * rng.standard_normal((config.num_samples, len(mean)))
-        if elites is None and problem.proposals is not None and len(problem.proposals):
-            samples[-len(problem.proposals):] = problem.proposals[-config.num_samples:]
-        return problem.clip(samples)
+        return problem.clip(samples if elites is not None else proposed(problem, samples))
 
     best, costs = cross_entropy(draw, problem.cost, config.num_iterations, config.num_elites)
     return judged_once_more(problem, best, costs)
+
+
+def proposed(problem: Problem, samples: np.ndarray) -> np.ndarray:
+    """Put proposals in place of the last samples (N, D); if too many, the last of them count."""
+    if problem.proposals is not None and len(problem.proposals):
+        samples[-len(problem.proposals):] = problem.proposals[-len(samples):]
+    return samples
 
 
 def judged_once_more(problem: Problem, best: np.ndarray, costs: np.ndarray) -> Solution:
