@@ -2,18 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nodes as one plain class: arrays in, arrays out, no rclpy to know."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+import math
+import secrets
 import threading
 import time
 from typing import Any, Self, TYPE_CHECKING
 
+from action_msgs.srv import CancelGoal
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import numpy as np
 from rcl_interfaces.srv import GetParameters, SetParameters
 import rclpy
-from rclpy.action import ActionClient
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.exceptions import InvalidNamespaceException
@@ -30,13 +32,14 @@ from tap_ros.errors import ConfigError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.subgoals import decode_subgoals
-from tap_ros.nodes.calls import call, CallError, Reaching, Spinner
+from tap_ros.nodes.calls import call, CallError, Spinner
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.reaching import CANCEL, Goals, Reaching
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.run import configure_fast_dds
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
-from tap_ros.text import escaped
+from tap_ros.text import escaped, listing
 
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
@@ -52,10 +55,12 @@ SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offer
     'get': (GetParameters, 'predictor_node/get_parameters', 'predictor_node'),
     'set': (SetParameters, 'predictor_node/set_parameters', 'predictor_node'),
     'set_planner': (SetParameters, 'visual_mpc_node/set_parameters', 'visual_mpc_node'),
-    'change': (ChangeState, 'predictor_node/change_state', 'predictor_node')}
+    'change': (ChangeState, 'predictor_node/change_state', 'predictor_node'),
+    'cancel': (CancelGoal, CANCEL, 'visual_mpc_node')}  # by default all goals
 READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'tracker_node': 'select',
-         'recorder_node': 'record'}
+         'recorder_node': 'record', 'visual_mpc_node': 'cancel'}
 PLANNER = 'visual_mpc_node'
+FOREVER_S = 1e9  # longer than threads can wait
 VIEWS = {'camera': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
          'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
 
@@ -83,7 +88,9 @@ class Client:
     """
     What other programs do with the nodes: predict, reach goals, reset scenes, record, look.
 
-    Each call ends within its time-out; errors name the node that is silent, ended or refused.
+    Each call ends within its time-out, a positive number of seconds; errors name the node that is
+    silent, has left the ROS graph or refused. Names, shapes and numbers that cannot be used raise
+    ConfigError before anything is sent.
 
     :param namespace: of the nodes.
     :param timeout_s: most seconds of a call that is given no other time-out.
@@ -93,15 +100,17 @@ class Client:
 
     def __init__(self, namespace: str = '', timeout_s: float = 20.0,
                  node: Node | None = None) -> None:
-        self.timeout_s = timeout_s
+        self.timeout_s = _seconds(timeout_s)
         self._context: Context | None = None
         if node is None:
             configure_fast_dds()
             self._context = Context()
             rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             try:
-                node = Node('tap_ros_client', namespace=namespace, context=self._context)
-            except InvalidNamespaceException as error:
+                # A name of its own, by which the planner can tell who has sent a goal.
+                node = Node(f'tap_ros_client_{secrets.token_hex(4)}', namespace=namespace,
+                            context=self._context)
+            except (InvalidNamespaceException, TypeError, UnicodeError) as error:
                 self._context.try_shutdown()
                 raise ConfigError(f'namespace {escaped(namespace, 60)}: is no name of a '
                                   'namespace, such as /left') from error
@@ -120,7 +129,9 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """End; a goal in progress goes on."""
+        """End; a goal in progress is cancelled."""
+        if 'goals' in self._made:
+            self._made['goals'].close()
         if self._context is not None:
             self._spinner.__exit__()
             self.node.destroy_node()
@@ -131,12 +142,12 @@ class Client:
 
     def is_ready(self, name: str) -> bool:
         """Tell whether a node ('predictor_node', ...) is ready, or one of SERVICES is offered."""
-        if name == PLANNER:
-            self._liveness(PLANNER)  # its heartbeat is watched from now on
-            return bool(self._planner().server_is_ready())
-        service = READY.get(name, name)
-        self._liveness(SERVICES[service][2])
-        return bool(self._service(service).service_is_ready())
+        return bool(self._service(READY.get(name, name)).service_is_ready())
+
+    def silence(self, name: str) -> str:
+        """Say for how long a node such as 'predictor_node' is silent; '' while it is not."""
+        silence: str = self._liveness(name).silence
+        return silence
 
     def wait_until_ready(self, *names: str, timeout_s: float = 90.0) -> None:
         """
@@ -146,7 +157,7 @@ class Client:
         :param timeout_s: most seconds to wait.
         :raises CallError: naming those that are not ready in time.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + _seconds(timeout_s)
         waiting = names or ('predictor_node', PLANNER)
         while waiting := tuple(name for name in waiting if not self.is_ready(name)):
             if time.monotonic() > deadline:
@@ -162,14 +173,13 @@ class Client:
         :param service: one of SERVICES.
         :param fields: of its request.
         :return: its response.
-        :raises CallError: when it does not answer in time, ends, or refuses.
+        :raises CallError: when it does not answer in time, leaves the ROS graph, or refuses.
         :raises ConfigError: for values that a field cannot hold.
         """
+        seconds, client = self._timeout(timeout_s), self._service(service)
         kind, _, server = SERVICES[service]
-        client, request = self._service(service), _message(kind.Request, fields)
-        # Compiling a task's model or cutting outlines may hold up the heartbeat of these nodes.
-        watched = None if service in ('reset', 'select') else self._liveness(server)
-        response = call(client, request, timeout_s or self.timeout_s, give_up, watched)
+        response = call(client, _message(kind.Request, fields), seconds, give_up,
+                        self._liveness(server))
         if not getattr(response, 'success', True):
             reason = getattr(response, 'message', 'the log of its node says why')
             raise CallError(f'{client.service_name} refused: {escaped(reason, 1000)}')
@@ -194,9 +204,12 @@ class Client:
             of topics are in the order of the message.
         :raises CallError: as call.
         """
-        response = self.call('predict', timeout_s, **request_fields(
-            start=start, goal=goal, start_objects=start_pixels, goal_objects=goal_pixels),
-            num_samples=num_samples, recursion_depth=recursion_depth, seed=seed, mode=mode)
+        left = _countdown(self._timeout(timeout_s))  # large pictures take their time
+        fields = request_fields(
+            start=start, goal=goal, start_objects=start_pixels, goal_objects=goal_pixels)
+        response = self.call(
+            'predict', left(), **fields, num_samples=num_samples,
+            recursion_depth=recursion_depth, seed=seed, mode=mode)
         return subgoals_of(response)
 
     def reach(self, goal: np.ndarray | None = None, goal_pixels: Mapping[str, Any] | None = None,
@@ -216,7 +229,7 @@ class Client:
         :param on_feedback: called with each feedback by another thread; without it they are
             kept for the iteration over what is returned.
         :param timeout_s: most seconds until the end; whoever waits for longer cancels the goal.
-        :return: Reaching, once the goal is accepted.
+        :return: Reaching, once the goal is accepted; it ends with this client at the latest.
         :raises CallError: when the planner does not answer, or rejects it: it has another goal.
         """
         pixels = goal_pixels or {}
@@ -224,8 +237,7 @@ class Client:
             tuple(pixels), goal_image=goal, goal_objects=list(pixels.values()) or None) | {
                 'mode': mode, 'step_budget': step_budget, 'recursion_depth': recursion_depth,
                 'num_samples': num_samples, 'seed': seed})
-        return Reaching(self._planner(), request, timeout_s, self.timeout_s, on_feedback,
-                        self._liveness(PLANNER))
+        return Reaching(self.goals, request, _seconds(timeout_s), self.timeout_s, on_feedback)
 
     def weights(self) -> str:
         """Return the predictor's weights, a name or a file."""
@@ -242,6 +254,8 @@ class Client:
                 self.call('change', transition=Transition(id=transition))
 
         change(Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+        if not _is_text(weights):
+            raise ConfigError(f'weights: expected a text, got {escaped(repr(weights), 60)}')
         parameter = Parameter('weights', value=weights).to_parameter_msg()
         answer, = self.call('set', parameters=[parameter]).results
         if not answer.successful:
@@ -259,11 +273,12 @@ class Client:
         :return: the first view of the camera, and the goal.
         :raises CallError: when the simulator refuses, or shows nothing.
         """
+        left = _countdown(self.timeout_s)
         self._views('goal')  # subscribed before something comes
-        before = self.camera(objects=objects).stamp_ns
-        self.call('reset', task=task, seed=seed, hide_arm=hide_arm)
-        goal = self.goal(before, objects)
-        return self.camera(goal.stamp_ns - 1, objects), goal
+        before = self.camera(objects=objects, timeout_s=left()).stamp_ns
+        self.call('reset', left(), task=task, seed=seed, hide_arm=hide_arm)
+        goal = self.goal(before, objects, left())
+        return self.camera(goal.stamp_ns - 1, objects, left()), goal
 
     def select(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """
@@ -271,8 +286,8 @@ class Client:
 
         :raises CallError: with the reason, such as a click on the robot; then nothing changes.
         """
-        u, v = np.reshape(list(pixels.values()), (-1, 2)).astype(float).T.tolist()
-        self.call('select', names=list(pixels), u=u, v=v)
+        u, v = _pixels(list(pixels.values()), 'pixels').T.tolist()
+        self.call('select', names=_names(pixels), u=u, v=v)
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""
@@ -313,16 +328,26 @@ class Client:
             return self._made[name]
 
     def _service(self, name: str) -> Any:
-        kind, topic, _ = SERVICES[name]
+        if name not in SERVICES:
+            raise ConfigError(f'{escaped(name, 60)}: is no node or service; expected one of '
+                              f'{listing([*READY, *SERVICES], 50)}')
+        kind, topic, server = SERVICES[name]
+        self._liveness(server)  # its heartbeat is heard from now on
         return self._once(topic, lambda: self.node.create_client(
             kind, topic, qos_profile=SERVICE_QOS, callback_group=self.answers))
 
-    def _planner(self) -> Any:
-        return self._once('reach_goal', lambda: ActionClient(
-            self.node, ReachGoal, 'reach_goal', callback_group=self._group))
+    @property
+    def goals(self) -> Goals:
+        """What sends goals."""
+        made: Goals = self._once('goals', lambda: Goals(
+            self.node, self._liveness(PLANNER), self._group, self.answers))
+        return made
 
     def _liveness(self, name: str) -> Any:
         return self._once(name, lambda: Liveness(self.node, name, self._group))
+
+    def _timeout(self, timeout_s: float | None) -> float:
+        return self.timeout_s if timeout_s is None else _seconds(timeout_s)
 
     def _views(self, name: str) -> Any:
         def subscribed() -> Observations:
@@ -333,7 +358,7 @@ class Client:
         return self._once(name, subscribed)
 
     def _view(self, name: str, after_ns: int, objects: bool, timeout_s: float | None) -> View:
-        views, timeout_s = self._views(name), timeout_s or self.timeout_s
+        views, timeout_s = self._views(name), self._timeout(timeout_s)
         found = views.wait(('image', 'objects') if objects else ('image',), timeout_s, after_ns)
         if found is None:
             silent = 'objects' if views.newest('image', after_ns=after_ns) else 'image'
@@ -350,16 +375,23 @@ def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any
     Turn pictures (H, W, 3) and pixels (K, 2) into messages; leave out those that are None.
 
     :param names: of the objects; by default 'object 1' and so on.
+    :param arrays: by field; what is called `objects`, or ends so, are pixels.
     :return: {field: message}.
+    :raises ConfigError: for other shapes, and for what is no text or number.
     """
     fields: dict[str, Any] = {}
     for name, values in arrays.items():
-        if values is None:
-            continue
-        values = np.asarray(values)
-        fields[name] = encode_image(values, to_stamp(0), CAMERA_FRAME) if values.ndim == 3 else (
-            encode_objects(names or [f'object {k + 1}' for k in range(len(values))], values,
-                           None, to_stamp(0), CAMERA_FRAME, ObjectStates.SOURCE_TRACKED))
+        if name.endswith('objects') and values is not None:
+            pixels = _pixels(values, name)
+            fields[name] = encode_objects(
+                _names(names or [f'object {k + 1}' for k in range(len(pixels))]), pixels, None,
+                to_stamp(0), CAMERA_FRAME, ObjectStates.SOURCE_TRACKED)
+        elif values is not None:
+            picture = np.asarray(values)
+            if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+                raise ConfigError(f'{name}: expected a picture, uint8 (height, width, 3), got '
+                                  f'{picture.dtype} {picture.shape}')
+            fields[name] = encode_image(picture, to_stamp(0), CAMERA_FRAME)
     return fields
 
 
@@ -380,7 +412,55 @@ def subgoals_of(response: PredictSubgoal.Response) -> 'list[Subgoal]':
 
 def _message(kind: Callable[..., Any], fields: Mapping[str, Any]) -> Any:
     """Return a message; raise ConfigError for what one of its fields cannot hold."""
+    for name, value in fields.items():
+        for text in value if isinstance(value, list) else [value]:
+            if isinstance(text, str) and not _is_text(text):
+                raise ConfigError(f'{name}: expected a text, got {escaped(repr(text), 60)}')
     try:
         return kind(check_fields=True, **fields)
     except AssertionError as error:
         raise ConfigError(escaped(error)) from error
+
+
+def _seconds(value: Any) -> float:
+    """Return a time-out; raise ConfigError for what is no positive number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not (
+            0 < value < math.inf):
+        raise ConfigError(
+            f'timeout_s: expected a positive number of seconds, got {escaped(value, 40)}')
+    return min(float(value), FOREVER_S)
+
+
+def _countdown(seconds: float) -> Callable[[], float]:
+    """Return a function that tells how many seconds are left, a millisecond at least."""
+    deadline = time.monotonic() + seconds
+    return lambda: max(deadline - time.monotonic(), 1e-3)
+
+
+def _names(names: Iterable[Any]) -> list[str]:
+    """Return names of objects; raise ConfigError for what a message cannot hold."""
+    for name in (names := list(names)):
+        if not _is_text(name):
+            raise ConfigError(
+                f'the name of an object: expected a text, got {escaped(repr(name), 60)}')
+    return names
+
+
+def _is_text(value: Any) -> bool:
+    """Tell whether a value is a text that UTF-8 can hold."""
+    try:
+        return isinstance(value, str) and bool(value.encode() or True)
+    except UnicodeError:
+        return False
+
+
+def _pixels(values: Any, what: str) -> np.ndarray:
+    """Return pixels (K, 2); raise ConfigError for what is none."""
+    try:
+        pixels = np.asarray(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pixels = np.empty(0)
+    if pixels.ndim != 2 or pixels.shape[1] != 2 or not np.isfinite(pixels).all():
+        raise ConfigError(f'{what}: expected pixels (u, v), two finite numbers for each object, '
+                          f'got {escaped(values, 60)}')
+    return pixels

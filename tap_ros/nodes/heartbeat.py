@@ -1,33 +1,30 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Heartbeats: the death of a node is noticed within a second."""
+"""What is known of other nodes: whether they are in the ROS graph, and how long silent."""
 
+from collections.abc import Callable, Collection
 import threading
 import time
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from tap_ros.nodes.observations import reception_time
+from tap_ros.nodes.subscriptions import publishers_of
 from tap_ros.text import escaped
 
 BEAT_S = 0.1
-LEASE_S = 0.4  # of the topic's liveliness, for other programs that watch it
-SILENT_S = 0.7  # s without a beat after which a node may be dead
-DOUBT_S = 0.1  # s more until it counts as dead: the watcher itself may have been delayed
-QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                 liveliness=LivelinessPolicy.AUTOMATIC,
-                 liveliness_lease_duration=Duration(seconds=LEASE_S))
+QUIET_S = 1.0  # s without a beat from which on silence is worth a word
+QOS = QoSProfile(depth=1)
 
 
 class Heartbeat:
     """
     Publish <node>/heartbeat ten times a second.
 
-    A thread does it: a long callback is no death; a killed or stopped process is.
+    A thread does it, so a long callback is no silence.
     """
 
     def __init__(self, node: Node) -> None:
@@ -46,17 +43,42 @@ class Heartbeat:
         while not self._ended.wait(BEAT_S):
             try:
                 self._publisher.publish(Header(stamp=self._node.get_clock().now().to_msg()))
-            except Exception as error:  # a thread that ends would make a living node look dead
+            except Exception as error:  # a thread that ends would make a living node look silent
                 self._node.get_logger().error(
                     f'heartbeat: {escaped(error)}', throttle_duration_sec=1.0)
 
 
+class Presence:
+    """
+    Tell whether all that were in the ROS graph once, such as the servers of a call, have left it.
+
+    The middleware removes a process that has ended, been killed, or stood still for longer than
+    the lease of its DDS participant: 3 s as nodes set it up (see run.configure_fast_dds). A new
+    process under the same name is another one; a busy one stays.
+
+    :param look: returns what identifies those that are there now.
+    """
+
+    def __init__(self, look: Callable[[], Collection[bytes]]) -> None:
+        self._look, self._there = look, frozenset(look())
+
+    @property
+    def gone(self) -> bool:
+        """Whether none is there any more; not while none has been seen yet."""
+        now = self._look()
+        self._there = self._there or frozenset(now)  # those that have just started
+        return bool(self._there) and self._there.isdisjoint(now)
+
+
+def publishers_present(node: Node, topic: str) -> Presence:
+    """Return the Presence of those that publish a topic now."""
+    return Presence(lambda: [one for found in publishers_of(node, [topic]).values()
+                             for one in found])
+
+
 class Liveness:
     """
-    Watch the heartbeat of a node.
-
-    Fast DDS also reports the loss of liveliness, but not always for a node that was restarted soon
-    after its death; so only the beats count.
+    Watch another node: it may fall silent, and leave the ROS graph.
 
     :param node: rclpy Node that watches; another thread spins it.
     :param name: of the node that is watched, as seen from this one's namespace.
@@ -65,35 +87,22 @@ class Liveness:
 
     def __init__(self, node: Node, name: str,
                  callback_group: CallbackGroup | None = None) -> None:
-        self.name = name
+        self.name, self._node = name, node
+        self._topic = f'{name}/heartbeat'
         self._beat_at: float | None = None  # monotonic time of the newest beat
-        self._doubted_at: float | None = None  # when its silence was seen first
-        self._changed = threading.Condition()
         node.create_subscription(
-            Header, f'{name}/heartbeat', self._on_beat,  # type: ignore[arg-type]  # with the info
+            Header, self._topic, self._on_beat,  # type: ignore[arg-type]  # with the info
             QOS, callback_group=callback_group)
 
+    def presence(self) -> Presence:
+        """Return the Presence of the processes that have this name now."""
+        return publishers_present(self._node, self._topic)
+
     @property
-    def dead(self) -> bool:
-        """Return whether the beats of a node have stopped; to be polled."""
-        now = time.monotonic()
-        if not self._silent(now):
-            self._doubted_at = None
-        elif self._doubted_at is None:
-            self._doubted_at = now
-        doubted_at = self._doubted_at
-        return doubted_at is not None and now - doubted_at > DOUBT_S
-
-    def wait_until_alive(self, seconds: float) -> bool:
-        """Wait until a dead node lives again; return whether it does, or was never alive."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._silent(time.monotonic()), seconds)
-
-    def _silent(self, now: float) -> bool:
-        beat_at = self._beat_at
-        return beat_at is not None and now - beat_at > SILENT_S
+    def silence(self) -> str:
+        """Say for how long the node has been silent; '' where that is nothing unusual."""
+        quiet_s = 0.0 if self._beat_at is None else time.monotonic() - self._beat_at
+        return f'{self.name} has been silent for {quiet_s:.1f} s' if quiet_s > QUIET_S else ''
 
     def _on_beat(self, _: Header, info: dict[str, Any]) -> None:
-        with self._changed:
-            self._beat_at = reception_time(info)
-            self._changed.notify_all()
+        self._beat_at = reception_time(info)

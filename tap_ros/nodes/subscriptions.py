@@ -130,6 +130,16 @@ def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, dict[bytes, st
         for topic in map(node.resolve_topic_name, topics)}
 
 
+def publishers_beside(node: Node, topic: str) -> list[str]:
+    """Return the full names of the nodes that publish on a topic beside this one, sorted."""
+    names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+             for info in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))]
+    own = node.get_fully_qualified_name()
+    if own in names:  # another one may have the same name
+        names.remove(own)
+    return sorted(names)
+
+
 def rivals(node: Node, topics: Iterable[str], known: Mapping[str, Mapping[bytes, str]]) -> str:
     """
     Say how many publish a topic where one of them, such as a second camera, is new; else ''.

@@ -11,7 +11,6 @@ from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from processes import Client, Newest, NodeProcess, until
-from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from sim_bridge.simulator import Simulator
@@ -20,8 +19,9 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 import tap_ros
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError, Reaching
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.heartbeat import Liveness
+from tap_ros.nodes.reaching import Reaching
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.planning.mpc_config import with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
@@ -41,8 +41,7 @@ class Loop:
     def __init__(self, node, folder):
         self.node, self.folder, self.processes = node, folder, {}
         self.client = tap_ros.Client(node=node, timeout_s=60.0)
-        self.reach_client = ActionClient(node, ReachGoal, 'reach_goal')
-        self.predictor_alive = Liveness(node, 'predictor_node')
+        self.predictor = Liveness(node, 'predictor_node')
         self.image = Newest(node, Image, 'camera/image_raw', STREAM)
         self.goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
         self.subgoal = Newest(node, Subgoal, 'subgoal', LATCHED)
@@ -90,7 +89,8 @@ class Loop:
 
     def begin(self, on_feedback=None, **fields):
         """Send a goal; return its Reaching."""
-        return Reaching(self.reach_client, ReachGoal.Goal(**fields), 300, 30, on_feedback)
+        return Reaching(
+            self.client.goals, ReachGoal.Goal(**fields), 300, 30, on_feedback)
 
     def reached(self, on_feedback=None, **fields):
         """Send a goal that is to be pursued to its end; return the result."""
@@ -140,11 +140,12 @@ def running_loop(folder):
             loop.start('visual_mpc_node', image_timeout=10.0, preset='quick')
             for process in loop.processes.values():
                 process.wait_for('ready', 120)
-            assert loop.reach_client.wait_for_server(30)
+            assert loop.client.goals.action.wait_for_server(30)
             loop.reset()
             loop.wait_until_seen()
             yield loop
         finally:
+            loop.client.close()
             for process in loop.processes.values():
                 process.kill()
 

@@ -27,7 +27,7 @@ def test_clicks_and_a_goal_picture_are_enough(tmp_path, client):
         select(loop.client, clicks)
         told = loop.goal_objects.wait(30)
         assert list(told.states) == ['seen', 'seen'] and told.source == 'tracked'
-        assert loop.reach_client.wait_for_server(30)
+        assert loop.client.goals.action.wait_for_server(30)
         loop.wait_until_seen()
         result = loop.reached(step_budget=3, seed=SEED)
         assert result.steps == 3 and len(loop.moves()) == 3 and loop.stopped()

@@ -6,15 +6,18 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 import json
 import threading
-import time
 from typing import Any, TYPE_CHECKING
 
+from action_msgs.msg import GoalStatus, GoalStatusArray
+from rclpy.qos import qos_profile_action_status_default
 from tap_msgs.action import ReachGoal
 from tap_ros.errors import TapError
 from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
-from tap_ros.nodes.calls import CallError, Reaching
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import Client
 from tap_ros.nodes.explorer.display import simulated
+from tap_ros.nodes.heartbeat import Presence, publishers_present
+from tap_ros.nodes.reaching import Reaching, STATUS
 from tap_ros.nodes.services import reason
 from tap_ros.text import escaped, listing
 from tap_ros.weights import PREDICTORS
@@ -24,8 +27,8 @@ if TYPE_CHECKING:
 
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
-END_S = 2.0  # that a cancel may take when the node ends
 LARGEST = 1e6  # of a pixel
+UNDER_WAY = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
 
 
 class CommandError(TapError):
@@ -83,8 +86,6 @@ class ExplorerCalls:
     Carries out the commands of browsers, each in a thread of its own; one goal at a time.
 
     :param node: that another thread spins; what happens is told it.
-    :ivar running: whether a goal that a browser asked for is in progress.
-    :ivar stage: what that goal is doing, '' without one.
     """
 
     def __init__(self, node: 'ExplorerNode') -> None:
@@ -92,13 +93,29 @@ class ExplorerCalls:
         self._client = Client(node=node, timeout_s=TIMEOUT_S)
         self._lock = threading.Lock()
         self._goal: Reaching | None = None
-        self.running = self._cancelled = self._ending = False
-        self.stage = ''
+        self._asked = self._cancelled = self._ending = False  # asked: by a browser, for a goal
+        self._stage = ''
+        self._under_way = False  # a goal, whoever sent it
+        self._planner: Presence | None = None  # that said so
+        node.create_subscription(GoalStatusArray, STATUS, self._on_status,
+                                 qos_profile_action_status_default)
         self._pool = ThreadPoolExecutor(4, 'explorer')
 
     def offered(self, service: str) -> bool:
         """Return whether a node offers a service, such as 'reset', 'set_goal' and 'select'."""
         return self._client.is_ready(service)
+
+    @property
+    def running(self) -> bool:
+        """Whether a goal is in progress, whoever sent it."""
+        return self._asked or (
+            self._under_way and self._planner is not None and not self._planner.gone)
+
+    @property
+    def stage(self) -> str:
+        """What the goal in progress is doing."""
+        return self._client.silence('visual_mpc_node') or self._stage or (
+            "another client's goal" if not self._asked else '')
 
     def do(self, text: str | bytes) -> None:
         """
@@ -112,25 +129,28 @@ class ExplorerCalls:
                 if not self.running:
                     raise CommandError('there is no goal to cancel')
                 self._cancelled = True  # also one that is about to begin
-                if self._goal is not None and self._node.executor is not None:
-                    self._node.executor.create_task(self._goal.handle.cancel_goal_async)
-                return
+                if self._goal is not None:
+                    self._goal.cancel()
+                    return
+                if not self._under_way:
+                    return
             if do == 'reach':
                 if self.running:
                     raise CommandError('a goal is in progress; cancel it or wait for its end')
-                self.running, self._cancelled = True, False
+                self._asked, self._cancelled = True, False
         self._pool.submit(self._carry_out, do, fields)
 
     def close(self) -> None:
         """Cancel the goal that a browser began, and end; in the thread that spins the node."""
         self._ending = self._cancelled = True
-        goal, executor = self._goal, self._node.executor
-        if goal is not None:
-            goal.handle.cancel_goal_async()
-        deadline = time.monotonic() + END_S
-        while self.running and executor is not None and time.monotonic() < deadline:
+        closing, executor = self._pool.submit(self._client.close), self._node.executor
+        while executor is not None and not closing.done():
             executor.spin_once(timeout_sec=0.05)  # nobody else does any more
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _on_status(self, message: GoalStatusArray) -> None:
+        self._under_way = any(one.status in UNDER_WAY for one in message.status_list)
+        self._planner = publishers_present(self._node, STATUS) if self._under_way else None
 
     # In the threads of the pool
 
@@ -144,7 +164,7 @@ class ExplorerCalls:
         finally:
             if do == 'reach':
                 with self._lock:
-                    self.running, self._goal, self.stage = False, None, ''
+                    self._asked, self._goal, self._stage = False, None, ''
 
     def _call(self, service: str, **fields: Any) -> Any:
         return self._client.call(service, give_up=lambda: self._ending, **fields)
@@ -192,6 +212,10 @@ class ExplorerCalls:
             self._node.newest.get('camera'), followed=self.offered('select'))
         self._node.tell('goal: what the camera sees now')
 
+    def _cancel(self) -> None:
+        self._call('cancel')
+        self._node.tell('cancelled: the goal of another client')
+
     def _predict(self) -> None:
         response = self._call('predict')
         self._node.tell(f'predicted in {response.model_time_ms:.0f} ms: '
@@ -199,7 +223,7 @@ class ExplorerCalls:
 
     def _reach(self, mode: str) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
-        self.stage = f'{words}: waiting for the planner'
+        self._stage = f'{words}: waiting for the planner'
         cancelled = self._cancelled
         if cancelled:
             raise CallError(f'{words}: cancelled before it began')
@@ -210,14 +234,10 @@ class ExplorerCalls:
         if cancelled:  # meanwhile
             goal.cancel()
         self._node.tell(f'{words}: begun')
-        try:
-            result = goal.result()
-        except CallError:
-            goal.cancel()  # its node may be no more than slow
-            raise
+        result = goal.result()
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
         self._node.tell(f'{words}: {end} ({result.steps} steps)')
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
-        self.stage = (f'step {feedback.step}, to the {escaped(feedback.stage, 60)}, plan in '
+        self._stage = (f'step {feedback.step}, to the {escaped(feedback.stage, 60)}, plan in '
                       f'{feedback.planning_ms:.0f} ms')

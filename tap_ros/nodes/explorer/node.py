@@ -177,6 +177,7 @@ class ExplorerNode(Node):
         """Bring what browsers see up to date."""
         # Before the log: how a run ended is told first, so that who sees no run sees how it ended.
         running, watched = self._calls.running, self._server.browsers
+        stage = self._calls.stage if running else ''
         with self._lock:
             newest = dict(self.newest)
             changed = self._changed if watched else self._changed - {*PICTURES}
@@ -210,8 +211,8 @@ class ExplorerNode(Node):
                      'pictured': 'goal' in newest,
                      'note': '' if 'goal' in newest else 'none yet'},
             'problem': problem,
-            'run': {'running': running, 'stage': self._calls.stage if running else '',
-                    'text': self._calls.stage or 'starting' if running else 'idle'},
+            'run': {'running': running, 'stage': stage,
+                    'text': stage or 'starting' if running else 'idle'},
             'diagnostics': [
                 {'name': name, 'level': level, 'message': text}
                 if now - came <= display.SILENT_S + 1 else

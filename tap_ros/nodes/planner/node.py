@@ -20,10 +20,11 @@ from tap_msgs.msg import CommandRefused
 from tap_ros.errors import ConfigError, PlanningError, TapError
 from tap_ros.messages.objects import check_found, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.messages.topics import JOINT_STATES
+from tap_ros.messages.topics import JOINT_STATES, TWIST
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import Client
 from tap_ros.nodes.diagnostics import Diagnostics
+from tap_ros.nodes.heartbeat import Presence
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.planner import settings
 from tap_ros.nodes.planner.arm import ArmCommander
@@ -31,9 +32,11 @@ from tap_ros.nodes.planner.goals import ask_subgoals, GoalSource
 from tap_ros.nodes.planner.plan_view import draw_plan
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import declare_parameters
+from tap_ros.nodes.reaching import sender_presence
 from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.services import reason
+from tap_ros.nodes.subscriptions import publishers_beside, steady_timer
 from tap_ros.nodes.topics import camera_topics, goal_topics, STREAM, to_stamp
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
@@ -41,15 +44,18 @@ from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, Command, End, Reach, Seen
 from tap_ros.planning.visual_mpc import VisualMPC
-from tap_ros.text import escaped
+from tap_ros.text import escaped, listing
 
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'
+DESERTED = 'the client that sent the goal has left the ROS graph'
+WATCH_S = 0.2  # s between two looks at whether the client of a goal is still there
+GONE_S = 4.0  # s after which a node that was killed has left the ROS graph
 RESULT_S = 60  # s that a result, and the pictures of its request, are kept for who asks for it
 
 
 class Cancelled(TapError):
-    """The goal was cancelled, or the node is ending or not active any more."""
+    """The goal was cancelled or deserted, or the node is ending or not active any more."""
 
 
 class VisualMpcNode(LifecycleBase):
@@ -68,6 +74,8 @@ class VisualMpcNode(LifecycleBase):
         self.params = declare_parameters(self)
         self._halt = ''  # why no goal may go on
         self._cancelled: ServerGoalHandle | None = None  # the goal that was cancelled last
+        self._deserted: ServerGoalHandle | None = None  # the goal whose client was lost last
+        self._senders: tuple[ServerGoalHandle, tuple[Presence, ...]] | None = None  # of a goal
         self._busy = threading.Lock()  # held while a goal is executed
         self._refusals: deque[tuple[int, str]] = deque(maxlen=10)
         # Plans in one thread: each that has planned keeps 70 MB of its own, by malloc's arenas.
@@ -92,6 +100,7 @@ class VisualMpcNode(LifecycleBase):
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
             goal_callback=self._on_goal, cancel_callback=self._on_cancel,
             result_timeout=RESULT_S)
+        steady_timer(self, WATCH_S, self._watch_sender, group)
         self.autostart('activate')
 
     def close(self) -> None:
@@ -164,6 +173,14 @@ class VisualMpcNode(LifecycleBase):
         self._sensors.wake()
         return CancelResponse.ACCEPT
 
+    def _watch_sender(self) -> None:
+        """Stop the arm when nobody is left who could cancel the goal."""
+        watched = self._senders
+        if watched is not None and any(one.gone for one in watched[1]):
+            self._deserted = watched[0]
+            self._arm.end(watched[0])  # at once, as by a cancel
+            self._sensors.wake()
+
     def _on_refused(self, message: CommandRefused) -> None:
         self._refusals.append((to_nanoseconds(message.header.stamp), escaped(message.message)))
         self._sensors.wake()
@@ -178,6 +195,8 @@ class VisualMpcNode(LifecycleBase):
             handle.abort()
             return result
         try:
+            self._senders = handle, sender_presence(self, bytes(handle.goal_id.uuid))
+            self._expect_no_rival(handle)
             self._arm.begin(handle)
             self._go_on(handle)
             self._worker.submit(self._reach, handle, time.monotonic(), result).result()
@@ -195,12 +214,24 @@ class VisualMpcNode(LifecycleBase):
             handle.abort()
         finally:
             try:
+                self._senders = None
                 self._arm.end(handle)
             finally:
                 self._busy.release()
         self.get_logger().info(
             f'reach_goal ended after {result.steps} steps: {escaped(result.message, 1000)}')
         return result
+
+    def _expect_no_rival(self, handle: ServerGoalHandle) -> None:
+        """Raise PlanningError if another node may command this arm."""
+        deadline = time.monotonic() + GONE_S
+        while others := publishers_beside(self, TWIST.name):
+            self._go_on(handle)
+            if time.monotonic() > deadline:
+                raise PlanningError(
+                    f'{listing(others)} may command this arm, too, by '
+                    f'{self.resolve_topic_name(TWIST.name)}: end it, or remap the topic')
+            time.sleep(WATCH_S)
 
     # One goal
 
@@ -252,7 +283,7 @@ class VisualMpcNode(LifecycleBase):
                                 'their pixels')
 
         def give_up() -> bool:
-            return self._is_cancelled(handle) or bool(self._halt)
+            return bool(self._why_end(handle))
 
         request = handle.request
         picture, objects = self._goal.take(self.params['image_timeout'], give_up)
@@ -321,10 +352,15 @@ class VisualMpcNode(LifecycleBase):
     def _is_cancelled(self, handle: ServerGoalHandle) -> bool:
         return self._cancelled is handle or handle.is_cancel_requested
 
+    def _why_end(self, handle: ServerGoalHandle) -> str:
+        """Return why a goal has to end, '' while it may go on."""
+        return 'cancelled' if self._is_cancelled(handle) else (
+            DESERTED if self._deserted is handle else self._halt)
+
     def _go_on(self, handle: ServerGoalHandle) -> None:
         """Raise Cancelled if the goal has to end."""
-        if self._is_cancelled(handle) or self._halt:
-            raise Cancelled('cancelled' if self._is_cancelled(handle) else self._halt)
+        if why := self._why_end(handle):
+            raise Cancelled(why)
 
 
 def cancel_is_known(handle: ServerGoalHandle, seconds: float = 1.0) -> bool:
