@@ -249,13 +249,14 @@ class Client:
 
         :raises CallError: when it cannot load them; then it has none.
         """
+        if not _is_text(weights):
+            raise ConfigError(f'weights: expected a text, got {escaped(repr(weights), 60)}')
+
         def change(*transitions: int) -> None:
             for transition in transitions:
                 self.call('change', transition=Transition(id=transition))
 
         change(Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
-        if not _is_text(weights):
-            raise ConfigError(f'weights: expected a text, got {escaped(repr(weights), 60)}')
         parameter = Parameter('weights', value=weights).to_parameter_msg()
         answer, = self.call('set', parameters=[parameter]).results
         if not answer.successful:
@@ -274,9 +275,11 @@ class Client:
         :raises CallError: when the simulator refuses, or shows nothing.
         """
         left = _countdown(self.timeout_s)
+        scene: dict[str, Any] = {'task': task, 'seed': seed, 'hide_arm': hide_arm}
+        _message(ResetScene.Request, scene)  # raises before anything is waited for
         self._views('goal')  # subscribed before something comes
         before = self.camera(objects=objects, timeout_s=left()).stamp_ns
-        self.call('reset', left(), task=task, seed=seed, hide_arm=hide_arm)
+        self.call('reset', left(), **scene)
         goal = self.goal(before, objects, left())
         return self.camera(goal.stamp_ns - 1, objects, left()), goal
 

@@ -10,10 +10,10 @@ import time
 from driven import Arm, goal_fields, MOVING_S, predict_fields, World
 from processes import Newest, NodeProcess, until
 from sensor_msgs.msg import JointState
-from tap_ros.contract import NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.nodes.client import Client, PLANNER, READY
-from tap_ros.nodes.heartbeat import Liveness
+from tap_ros.nodes.heartbeat import publishers_present
+from tap_ros.nodes.subscriptions import publishers_of
 from tap_ros.nodes.topics import STREAM
 
 CALL_S = 20.0
@@ -34,7 +34,6 @@ class Rig:
         self._reaching = None
         self.joints = Newest(self.node, JointState, 'joint_states', STREAM)
         self.arm = Arm(self.node)
-        self.alive = {name: Liveness(self.node, name) for name in NODE_CLASSES}
 
     def __enter__(self):
         return self
@@ -63,6 +62,10 @@ class Rig:
         for name, process in list(self.processes.items()):
             if name not in wanted or process.parameters != wanted[name] or not process.alive:
                 self.remove(name)
+        if self._reaching is not None and PLANNER in self.processes:
+            with suppress(TapError):  # it may have ended
+                self.finish(self._reaching)
+            time.sleep(1.0)
         new = [self.start(name, **parameters) for name, parameters in wanted.items()
                if name not in self.processes]
         for process in new:
@@ -73,10 +76,6 @@ class Rig:
             if 'predictor_node' in wanted:
                 self.expect_prediction(CALL_S)
             time.sleep(0.5)  # what has no name to wait for: its subscriptions
-        elif self._reaching is not None and PLANNER in wanted:
-            with suppress(TapError):  # it may have ended, or looked dead on a busy machine
-                self.finish(self._reaching)
-            time.sleep(1.0)
         self._reaching, self.arm.refusing = None, False
         self.arm.forget()
 
@@ -86,9 +85,17 @@ class Rig:
         return self.processes[name]
 
     def restart(self, name):
-        """Start a killed node again, and wait until it is ready and its heartbeat is heard."""
+        """Start a killed node again, and wait until it is ready and known."""
+        before = self._there(name)
         self.processes[name].start().wait_for('ready')
-        self.alive[name].wait_until_alive(5.0)
+        assert until(lambda: self._there(name) - before and self.client.is_ready(name), 20.0)
+
+    def presence(self, name):
+        """Return the Presence of a node."""
+        return publishers_present(self.node, f'{name}/heartbeat')
+
+    def _there(self, name):
+        return set(*publishers_of(self.node, [f'{name}/heartbeat']).values())
 
     def remove(self, name):
         """End a node, politely first."""

@@ -14,14 +14,13 @@ import hypothesis
 from hypothesis import strategies as st
 import pytest
 from rcl_interfaces.srv import GetParameters
-from rclpy.action import ActionClient
 from rclpy.qos import QoSProfile
-from tap_msgs.action import ReachGoal
 from tap_ros.contract import GRIPPER_JOINTS, MAP_ENCODING, MASK_ENCODING, NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.images.encodings import ENCODINGS
 from tap_ros.nodes import heartbeat
-from tap_ros.nodes.calls import call, CallError, Reaching
+from tap_ros.nodes.calls import call, CallError
+from tap_ros.nodes.reaching import Reaching
 from tap_ros.nodes.topics import LATCHED
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.ur10e import UR10E
@@ -166,7 +165,6 @@ class Target:
                          for name, kind in SERVICES.items()}
         self._parameters = {name: rig.node.create_client(GetParameters, f'{name}/get_parameters')
                             for name in NODE_CLASSES}
-        self._reach = ActionClient(rig.node, ReachGoal, 'reach_goal')
         self.restore()
 
     def close(self):
@@ -213,7 +211,7 @@ class Target:
     def _pursue(self, goal):
         """Send a goal, let it begin, and cancel it; raise TapError if it does not end."""
         try:
-            reaching = Reaching(self._reach, goal, 3 * ANSWER_S, ANSWER_S)
+            reaching = Reaching(self._rig.client.goals, goal, 3 * ANSWER_S, ANSWER_S)
         except CallError as error:
             if 'rejected' not in str(error):  # as another one is pursued
                 raise

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The public client and the command `call` with real nodes: what they do, and who is silent."""
 
+import math
 from pathlib import Path
 import re
 import threading
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import tap_ros
 from tap_ros.cli import main
+from tap_ros.errors import ConfigError
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.predictor.node import OVERLAY_SCALE
@@ -92,6 +94,28 @@ def test_it_names_who_is_silent():
                 (lambda: client.wait_until_ready('sim_node', timeout_s=0.2), 'sim_node')):
             with pytest.raises(CallError, match=silent):
                 ask()
+
+
+IMAGE = np.zeros((8, 8, 3), np.uint8)
+
+
+@pytest.mark.parametrize('ask', [
+    lambda client: client.set_goal({5: (1, 1)}), lambda client: client.set_goal({'a': (1,)}),
+    lambda client: client.set_goal({'\ud800': (1, 1)}),
+    lambda client: client.set_goal({'a': (1, math.nan)}),
+    lambda client: client.reach(goal_pixels={5: (1, 1)}),
+    lambda client: client.reach(goal=IMAGE[0]), lambda client: client.reach(timeout_s=math.nan),
+    lambda client: client.reach(seed='1'), lambda client: client.select({'a': 'ab'}),
+    lambda client: client.select({None: (1, 1)}), lambda client: client.reset('\ud800'),
+    lambda client: client.predict(IMAGE / 2), lambda client: client.predict(start_pixels=[1, 2]),
+    lambda client: client.predict(timeout_s=0), lambda client: client.predict(num_samples=0.5),
+    lambda client: client.camera(timeout_s=-1), lambda client: client.use_weights(5),
+    lambda client: client.wait_until_ready('nobody'), lambda client: client.call('nobody'),
+    lambda client: client.wait_until_ready(timeout_s=math.inf),
+    lambda client: tap_ros.Client(timeout_s='1'), lambda client: tap_ros.Client('a b')])
+def test_what_cannot_be_sent_is_said_before_it_is_sent(ask):
+    with tap_ros.Client('/nobody', timeout_s=0.2) as client, pytest.raises(ConfigError):
+        ask(client)
 
 
 def test_the_example_of_its_page_runs(loop, capsys):

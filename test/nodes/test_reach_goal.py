@@ -5,23 +5,32 @@
 from pathlib import Path
 import re
 import signal
+import subprocess
+import sys
 import threading
 
+from geometry_msgs.msg import TwistStamped
 from lively import lively_network
 from loop import acts_like, SEED
 import numpy as np
-from processes import Lifecycle, Newest, until
+from processes import Client, Lifecycle, Newest, until
 import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
+from tap_msgs.action import ReachGoal
 from tap_ros.messages.images import decode_image
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.planner.plan_view import CHOSEN
+from tap_ros.nodes.reaching import Reaching, sender_presence
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.training.weights import save_weights, stored_digest
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
 pytestmark = pytest.mark.slow
+CLIENT = """
+import os, signal, sys, tap_ros
+for feedback in tap_ros.Client().reach(mode='direct', step_budget=1000):
+"""
 
 
 def served(loop, steps=1):
@@ -144,19 +153,67 @@ def test_when_the_predictor_hangs_or_dies_the_arm_stays_and_the_planner_lives(lo
     assert 'libfastrtps' in maps and '/dev/shm/fast' not in maps, 'no shared memory'
     predictor.send(signal.SIGSTOP)
     try:
-        assert until(lambda: loop.predictor_alive.dead, 10)
-        with pytest.raises(CallError, match='predictor_node, has ended'):
+        with loop.set(predictor_timeout=1.5):  # silent is not dead
+            aborted(loop, '/predict_subgoal', 'predictor_node has been silent', step_budget=2)
+        with pytest.raises(CallError, match='has left the ROS graph .* ended or stands still'):
             loop.client.call('predict')
-        with loop.set(predictor_timeout=0.5):
-            aborted(loop, '/predict_subgoal', step_budget=2)
     finally:
         predictor.send(signal.SIGCONT)
     predictor.kill()
     aborted(loop, '/predict_subgoal', step_budget=4)
     served(loop)
     predictor.start().wait_for('ready', 120)  # soon: Fast DDS has not given up the one before
-    assert loop.predictor_alive.wait_until_alive(30)
     loop.wait_until_seen()
+
+
+@pytest.mark.parametrize('stands_s', [1.5, 5.0])
+def test_a_goal_whose_client_gave_up_moves_nothing(loop, stands_s):
+    loop.reset()
+    planner = loop.processes['visual_mpc_node']
+    log_bytes = len(planner.text)
+    planner.send(signal.SIGSTOP)
+    try:
+        with pytest.raises(CallError, match='visual_mpc_node has been silent for'):
+            Reaching(loop.client.goals, ReachGoal.Goal(mode='direct'), 300, 1.2)
+        threading.Event().wait(stands_s - 1.2)
+    finally:
+        planner.send(signal.SIGCONT)
+    assert until(lambda: 'reach_goal ended after 0 steps' in planner.text[log_bytes:], 60)
+    served(loop)
+    assert len(loop.moves()) == 1
+
+
+@pytest.mark.parametrize('end, why', [
+    ('os.kill(os.getpid(), signal.SIGKILL)', 'has left the ROS graph'),
+    ('os.kill(os.getpid(), signal.SIGINT)', 'cancelled'), ('sys.exit(0)', 'cancelled')])
+def test_a_goal_ends_with_its_client(loop, end, why):
+    loop.reset()
+    planner = loop.processes['visual_mpc_node']
+    log_bytes = len(planner.text)
+    subprocess.run([sys.executable, '-c', f'{CLIENT}    {end}'], timeout=120)
+    assert until(lambda: re.search('reach_goal ended .* steps: .*', planner.text[log_bytes:]), 60)
+    assert why in planner.text[log_bytes:] and len(loop.moves()) and loop.stopped()
+    served(loop)
+
+
+def test_a_goal_of_another_program_is_alone_when_nobody_takes_feedback_any_more(client):
+    with Client('theirs') as theirs:
+        theirs.create_subscription(String, 'reach_goal/_action/feedback', print, STREAM)
+        assert until(lambda: client.count_subscribers('reach_goal/_action/feedback'))
+        sender, listeners = sender_presence(client, bytes(16))
+        assert not sender.gone and not listeners.gone
+    assert until(lambda: listeners.gone) and not sender.gone
+
+
+def test_a_planner_whose_arm_another_node_commands_refuses_goals(loop):
+    loop.reset()
+    publisher = loop.node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
+    try:
+        assert until(lambda: loop.node.count_publishers('arm/delta_twist_cmds') == 2)
+        aborted(loop, '/test_client may command this arm', '/arm/delta_twist_cmds', mode='direct')
+    finally:
+        loop.node.destroy_publisher(publisher)
+    served(loop)
 
 
 def test_a_planner_that_is_deactivated_stops_the_arm_and_serves_again_later(loop):

@@ -214,7 +214,7 @@ class ExplorerCalls:
 
     def _cancel(self) -> None:
         self._call('cancel')
-        self._node.tell('cancelled: the goal of another client')
+        self._node.tell('cancel: the planner was asked to end its goal, whoever sent it')
 
     def _predict(self) -> None:
         response = self._call('predict')
