@@ -57,17 +57,18 @@ class Presence:
     process under the same name is another one; a busy one stays.
 
     :param look: returns what identifies those that are there now.
+    :ivar there: what it returned first, where that was not nothing.
     """
 
     def __init__(self, look: Callable[[], Collection[bytes]]) -> None:
-        self._look, self._there = look, frozenset(look())
+        self._look, self.there = look, frozenset(look())
 
     @property
     def gone(self) -> bool:
         """Whether none is there any more; not while none has been seen yet."""
         now = self._look()
-        self._there = self._there or frozenset(now)  # those that have just started
-        return bool(self._there) and self._there.isdisjoint(now)
+        self.there = self.there or frozenset(now)  # those that have just started
+        return bool(self.there) and self.there.isdisjoint(now)
 
 
 def publishers_present(node: Node, topic: str) -> Presence:

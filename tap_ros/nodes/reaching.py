@@ -309,19 +309,21 @@ class Reaching:
             raise CallError(f'node {node.get_name()}: its callbacks keep it busy') from error
 
 
-def sender_presence(node: Node, goal_id: bytes) -> tuple[Presence, Presence]:
+def watch_sender(node: Node, goal_id: bytes) -> Callable[[], bool]:
     """
-    Return the Presence of who has sent a goal, and of all that listen to its feedback.
+    Return a function that tells whether who has sent a goal has left the ROS graph.
 
-    The former is known where its client is a Client of this package; a goal that one of them
-    says is left alone has to end.
+    A Client of this package is known by the id. Of other programs it is known that they listen to
+    the feedback of their goals: none may be left of those that did when the goal was accepted.
 
     :param node: that serves the goal; goal_id: its 16 bytes.
     """
     def there() -> set[bytes]:
         return {one for one, *_ in _listeners(node)}
 
-    return Presence(lambda: there() & {goal_id[:SENDER_BYTES]}), Presence(there)
+    sender = Presence(lambda: there() & {goal_id[:SENDER_BYTES]})
+    listeners = Presence(there)
+    return lambda: sender.gone or (not sender.there and listeners.gone)
 
 
 def _listeners(node: Node) -> list[tuple[bytes, str, str]]:

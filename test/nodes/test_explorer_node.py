@@ -7,6 +7,7 @@ from functools import partial
 import json
 import re
 import shutil
+import time
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from loop import SEED
@@ -34,19 +35,21 @@ class Explored:
 
     @contextmanager
     def page(self):
-        """Give a function that sends commands, and one that returns the next state."""
+        """Give a function that sends commands, and one that returns the next such state."""
         with connect(self.url.replace('http', 'ws') + 'socket', open_timeout=10) as page:
             def ask(*commands):
                 for command in commands:
                     page.send(json.dumps(command))
 
-            def told():
-                while True:
+            def told(accept=lambda state: True):
+                deadline = time.monotonic() + 60
+                while time.monotonic() < deadline:
                     text = page.recv(30)
                     found = json.loads(text) if isinstance(text, str) else {'kind': 'picture'}
                     assert found['kind'] != 'error', text
-                    if found['kind'] == 'state':
+                    if found['kind'] == 'state' and accept(found):
                         return found
+                raise AssertionError('no such state')
 
             yield ask, told
 
@@ -198,13 +201,10 @@ def test_a_goal_of_another_client_is_seen_and_can_be_cancelled(explored):
     with explored.page() as (ask, told):
         assert not told()['run']['running']
         reaching = explored.loop.begin(mode='direct', step_budget=1000)
-        while not (now := told())['run']['running']:
-            pass
-        assert 'another client' in now['run']['stage']
+        assert 'another client' in told(lambda now: now['run']['running'])['run']['stage']
         ask({'do': 'cancel'})
         assert reaching.result().end == 'cancelled'
-        while told()['run']['running']:
-            pass
+        told(lambda now: not now['run']['running'])
 
 
 def test_a_goal_can_be_cancelled_at_once_and_ends_with_the_explorer(explored):
@@ -217,8 +217,7 @@ def test_a_goal_can_be_cancelled_at_once_and_ends_with_the_explorer(explored):
     with explored.page() as (ask, told):
         count = told()['log_count']
         ask(*7 * [{'do': 'predict'}], reach, {'do': 'cancel'})
-        while (now := told())['log_count'] < count + 8 or now['run']['running']:
-            pass
+        told(lambda now: now['log_count'] >= count + 8 and not now['run']['running'])
         assert GoalStatus.STATUS_SUCCEEDED not in statuses
         ask(reach)
         assert until(lambda: statuses and statuses[-1] == GoalStatus.STATUS_EXECUTING)

@@ -21,7 +21,7 @@ from tap_msgs.action import ReachGoal
 from tap_ros.messages.images import decode_image
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.planner.plan_view import CHOSEN
-from tap_ros.nodes.reaching import Reaching, sender_presence
+from tap_ros.nodes.reaching import Reaching, watch_sender
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.training.weights import save_weights, stored_digest
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
@@ -200,9 +200,9 @@ def test_a_goal_of_another_program_is_alone_when_nobody_takes_feedback_any_more(
     with Client('theirs') as theirs:
         theirs.create_subscription(String, 'reach_goal/_action/feedback', print, STREAM)
         assert until(lambda: client.count_subscribers('reach_goal/_action/feedback'))
-        sender, listeners = sender_presence(client, bytes(16))
-        assert not sender.gone and not listeners.gone
-    assert until(lambda: listeners.gone) and not sender.gone
+        gone = watch_sender(client, bytes(16))
+        assert not gone()
+    assert until(gone)
 
 
 def test_a_planner_whose_arm_another_node_commands_refuses_goals(loop):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 import json
 import threading
+import time
 from typing import Any, TYPE_CHECKING
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
+END_S = 6.0  # that a cancel may take when the node ends
 LARGEST = 1e6  # of a pixel
 UNDER_WAY = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
 
@@ -144,7 +146,9 @@ class ExplorerCalls:
         """Cancel the goal that a browser began, and end; in the thread that spins the node."""
         self._ending = self._cancelled = True
         closing, executor = self._pool.submit(self._client.close), self._node.executor
-        while executor is not None and not closing.done():
+        deadline = time.monotonic() + END_S
+        while executor is not None and time.monotonic() < deadline and (
+                self._asked or not closing.done()):
             executor.spin_once(timeout_sec=0.05)  # nobody else does any more
         self._pool.shutdown(wait=False, cancel_futures=True)
 

@@ -3,6 +3,7 @@
 """Serves reach_goal: drives planning.reach by what is seen, and sends its commands."""
 
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -24,7 +25,6 @@ from tap_ros.messages.topics import JOINT_STATES, TWIST
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import Client
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.heartbeat import Presence
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.planner import settings
 from tap_ros.nodes.planner.arm import ArmCommander
@@ -32,7 +32,7 @@ from tap_ros.nodes.planner.goals import ask_subgoals, GoalSource
 from tap_ros.nodes.planner.plan_view import draw_plan
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import declare_parameters
-from tap_ros.nodes.reaching import sender_presence
+from tap_ros.nodes.reaching import watch_sender
 from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.services import reason
@@ -75,7 +75,7 @@ class VisualMpcNode(LifecycleBase):
         self._halt = ''  # why no goal may go on
         self._cancelled: ServerGoalHandle | None = None  # the goal that was cancelled last
         self._deserted: ServerGoalHandle | None = None  # the goal whose client was lost last
-        self._senders: tuple[ServerGoalHandle, tuple[Presence, ...]] | None = None  # of a goal
+        self._sender_gone: tuple[ServerGoalHandle, Callable[[], bool]] | None = None
         self._busy = threading.Lock()  # held while a goal is executed
         self._refusals: deque[tuple[int, str]] = deque(maxlen=10)
         # Plans in one thread: each that has planned keeps 70 MB of its own, by malloc's arenas.
@@ -175,10 +175,10 @@ class VisualMpcNode(LifecycleBase):
 
     def _watch_sender(self) -> None:
         """Stop the arm when nobody is left who could cancel the goal."""
-        watched = self._senders
-        if watched is not None and any(one.gone for one in watched[1]):
-            self._deserted = watched[0]
-            self._arm.end(watched[0])  # at once, as by a cancel
+        handle, gone = self._sender_gone or (None, None)
+        if gone is not None and self._deserted is not handle and gone():
+            self._deserted = handle
+            self._arm.end(handle)  # at once, as by a cancel
             self._sensors.wake()
 
     def _on_refused(self, message: CommandRefused) -> None:
@@ -195,7 +195,7 @@ class VisualMpcNode(LifecycleBase):
             handle.abort()
             return result
         try:
-            self._senders = handle, sender_presence(self, bytes(handle.goal_id.uuid))
+            self._sender_gone = handle, watch_sender(self, bytes(handle.goal_id.uuid))
             self._expect_no_rival(handle)
             self._arm.begin(handle)
             self._go_on(handle)
@@ -214,7 +214,7 @@ class VisualMpcNode(LifecycleBase):
             handle.abort()
         finally:
             try:
-                self._senders = None
+                self._sender_gone = None
                 self._arm.end(handle)
             finally:
                 self._busy.release()
