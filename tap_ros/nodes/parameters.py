@@ -21,6 +21,7 @@ from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
 from tap_ros.plugins import names
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
+from tap_ros.text import listing
 
 # Of several nodes: default, description, and what else Parameters.declare takes.
 SHARED: dict[str, tuple[Any, str, dict[str, Any]]] = {
@@ -137,14 +138,14 @@ class Parameters:
         """
         Return the pose (4, 4) of the camera, by the parameters of declare_camera.
 
-        :raises ConfigError: for a quaternion of length 0.
+        :raises ConfigError: for a quaternion of length 0, and for what is not finite.
         """
         place, quaternion = ([self[f'camera_{axis}'] for axis in axes]
                              for axes in ('xyz', ('qx', 'qy', 'qz', 'qw')))
         try:
             return pose_matrix(place, quaternion)
         except ConfigError as error:
-            raise ConfigError(f'parameters camera_qx to camera_qw: {error}') from error
+            raise ConfigError(f'parameters camera_x to camera_qw: {error}') from error
 
     def _check_choices(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse strings that are none of the choices."""
@@ -173,9 +174,11 @@ def pose_matrix(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarr
     """
     Return a pose (4, 4) of a place (3,), m, and a quaternion x, y, z, w of any length.
 
-    :raises ConfigError: for a quaternion of length 0.
+    :raises ConfigError: for a quaternion of length 0, and for what is not finite.
     """
     from scipy.spatial.transform import Rotation  # later, since not every node needs it
+    if not np.isfinite([*place, *quaternion]).all():
+        raise ConfigError(f'a pose of {listing([*place, *quaternion])}; expected finite numbers')
     if not np.linalg.norm(quaternion) > 0.1:
         raise ConfigError('a quaternion of no direction')
     pose = np.eye(4)

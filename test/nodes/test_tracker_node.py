@@ -113,7 +113,7 @@ def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(
     first, second = clicks.values()
     for asked, words in (
             ({'names': ['a'], 'u': [first[0]], 'v': []}, '1, 1 and 0 entries'),
-            ({'names': [], 'u': [], 'v': []}, 'at least one'),
+            ({'names': [], 'u': [], 'v': []}, 'as many of each, 1 to'),
             ({'names': ['a', 'a'], 'u': [first[0], second[0]], 'v': [first[1], second[1]]},
              'a name of its own'),
             ({'names': ['a' * 200], 'u': [first[0]], 'v': [first[1]]}, 'characters'),
