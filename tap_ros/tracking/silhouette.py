@@ -16,7 +16,7 @@ COMMON = 0.12  # share of the ring around that a colour of the table has at leas
 SHADES = (1.0, 0.5)  # of the table's light, in shadows of objects
 LIKELY, POSSIBLE, SURE = 12.0, 6.0, 25.0  # from the table's colours, of what may be the object
 FLAT = 0.3  # share of a silhouette that is its top at least, else the object is not upright
-LEAST_AREA = 25  # px
+LEAST_AREA = 64  # px; more than CORE, which is taken for the object whatever it shows
 LEAST_CONTRAST = 7.0  # of the object's colours and the table's, for a click to be believed
 _RINGS = (0.75, 1.3)  # of RADIUS, between which the table is seen
 
