@@ -16,6 +16,7 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates
 import tap_ros
 from tap_ros.contract import CONTROL_PERIOD
+from tap_ros.errors import TapError
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
@@ -272,6 +273,8 @@ def test_requests_of_no_use_are_refused_with_the_remedy(client):
             why = eye.ask(names=['a'], u=[65.0], v=[50.0])
             assert why.startswith('camera/pose: ') or ': camera/pose: ' in why
         eye.calibrate()
+        with pytest.raises(TapError, match='does not look down'):
+            LocalNode(TrackerNode, camera_z=0.06, camera_y=-1.0, camera_qx=0.7, camera_qw=-0.7)
         other.create_publisher(Image, '/asked/camera/image_raw', STREAM)
         assert until(lambda: client.count_publishers('/asked/camera/image_raw') == 2)
         why = eye.ask(names=['a'], u=[65.0], v=[50.0])

@@ -131,6 +131,15 @@ def test_what_moved_from_one_picture_to_another_is_proposed():
     assert propose(draw(STARTS), draw(STARTS)).shape == (0, 2)
 
 
+@pytest.mark.parametrize('noise', [8, 16, 30])
+def test_noise_is_no_object(noise):
+    picture = table() + np.random.default_rng(0).normal(0, noise, (SIZE, SIZE, 3))
+    view = View(picture.clip(0, 255).astype(np.uint8))
+    for click in np.random.default_rng(1).uniform(0, SIZE - 1, (10, 2)):
+        with pytest.raises(TrackingError, match='on nothing that differs'):
+            load_plugin('tap_ros.trackers', 'rigid')(None).select(view, [click])
+
+
 @pytest.mark.parametrize('look', LOOKS)
 def test_what_a_click_selects_has_an_object_under_it(look):
     """Wherever one clicks: table, its rim, its shadows, what is behind it."""
