@@ -69,6 +69,8 @@ def generate_launch_description():
         start('explorer_node', condition=IfCondition(LaunchConfiguration('explorer'))),
         Node(
             package='rviz2', executable='rviz2', output='screen',
+            namespace=LaunchConfiguration('namespace'),
+            remappings=[('/tf', 'tf'), ('/tf_static', 'tf_static')],
             arguments=['-d', PathJoinSubstitution(
                 [FindPackageShare('tap_ros'), 'config', 'layouts', 'tap_ros.rviz'])],
             parameters=[{'use_sim_time': typed('use_sim_time', bool)}],

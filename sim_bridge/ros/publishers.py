@@ -58,9 +58,9 @@ class ScenePublishers:
         self._moving = self._fixed = None
         if find_spec('tf2_msgs') is not None:  # no wheel has it
             from tf2_msgs.msg import TFMessage
-            # Qualities as of tf2_ros' broadcasters.
-            self._moving = node.create_publisher(TFMessage, '/tf', QoSProfile(depth=100))
-            self._fixed = node.create_publisher(TFMessage, '/tf_static', LATCHED)
+            # Qualities as of tf2_ros' broadcasters; in its namespace, as frames have no prefix.
+            self._moving = node.create_publisher(TFMessage, 'tf', QoSProfile(depth=100))
+            self._fixed = node.create_publisher(TFMessage, 'tf_static', LATCHED)
 
     def moment(self, world: World, seen: Observation, stamp: Time) -> None:
         """Publish a moment; its transforms once: of a second time listeners would complain."""

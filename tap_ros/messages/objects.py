@@ -52,7 +52,8 @@ def decode_states(message: Any, name: str) -> tuple[str, ...]:
     :param message: tap_msgs/ObjectStates.
     :raises PlanningError: for another number of states than objects, and for unknown ones.
     """
-    states = tuple(message.states)
+    _check_count(message, name)
+    states = tuple(message.states[:MAX_OBJECTS + 1])
     if states and (len(states) != len(message.objects) or not {*states} <= {*STATES}):
         raise PlanningError(
             f'{name}: states are {escaped(listing(states))} of {len(message.objects)} objects; '
@@ -85,9 +86,7 @@ def decode_objects(message: Any, name: str,
     :raises PlanningError: for too many objects, for names that are empty, too long or used twice,
         and for pixels that are unknown or outside the picture.
     """
-    if len(message.objects) > MAX_OBJECTS:
-        raise PlanningError(
-            f'{name}: has {len(message.objects)} objects; at most {MAX_OBJECTS} are taken')
+    _check_count(message, name)
     names = tuple(state.name for state in message.objects)
     pixels = np.array([(state.u, state.v) for state in message.objects]).reshape(len(names), 2)
     for index, object_name in enumerate(names):
@@ -124,6 +123,13 @@ def decode_cut_objects(message: Any, name: str, size: Sequence[int],
             f'{name}: {listing(outside)} not in the part of the picture that the weights see, '
             f'{width}x{height} pixels from ({left}, {top}) on; leave it out')
     return names, cut
+
+
+def _check_count(message: Any, name: str) -> None:
+    """Refuse more objects than MAX_OBJECTS, before anything looks at each."""
+    if len(message.objects) > MAX_OBJECTS:
+        raise PlanningError(
+            f'{name}: has {len(message.objects)} objects; at most {MAX_OBJECTS} are taken')
 
 
 def _check_pixel(name: str, pixel: np.ndarray, size: Sequence[int] | None) -> None:

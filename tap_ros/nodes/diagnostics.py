@@ -13,7 +13,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from tap_ros.nodes.subscriptions import steady_timer, why_silent
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from tap_ros.nodes.subscriptions import rivals, steady_timer, why_silent
 from tap_ros.text import escaped
 
 PERIOD = 1.0  # s
@@ -22,6 +23,7 @@ RATE_SECONDS = 10.0  # over which rates are taken
 WORK_SECONDS = 60.0  # over which percentiles are taken
 ERROR_SECONDS = 10.0  # that the level is ERROR after an error
 SILENT_SECONDS = 5.0  # of an input, after which a warning says why
+CAMERA_TYPES = (Image, CompressedImage, CameraInfo)  # of which a topic has one publisher
 LIMIT = 1000  # events of a kind that are remembered, the newest ones
 
 
@@ -57,7 +59,8 @@ class Diagnostics:
     """
     Publishes the state of a node's work and inputs; its methods may be called from any thread.
 
-    An input that falls silent, or never comes, is named in the log with the reason and the remedy.
+    An input that falls silent, or never comes, is named in the log with the reason and the remedy;
+    so are cameras that publish on one topic.
 
     Status of the work: ERROR for ERROR_SECONDS after an error, else WARN with the reason while
     `idle` returns one, else OK.
@@ -82,6 +85,7 @@ class Diagnostics:
         self._inputs = {topic: Record() for topic in self._max_age_s}
         self._expected = {node.resolve_topic_name(topic) for topic in expected}
         self._told: set[str] = set()  # topics whose silence has been logged
+        self._shared: set[str] = set()  # topics of which it has been logged that several publish
         self._work: dict[str, Record] = {}
         self._errors, self._last_error, self._error_time = 0, '', -math.inf
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -114,17 +118,22 @@ class Diagnostics:
             for topic, source in self._inputs.items():
                 message.status.append(self._describe_input(topic, source, now))
         self._publisher.publish(message)
-        if not idle:
-            self._tell_silence(now)
+        self._tell_silence(now)
 
     def _tell_silence(self, now: float) -> None:
-        """Warn, once for each silence, of inputs on which something should come."""
+        """Warn, once each time, of inputs that are silent, and of cameras that share a topic."""
         silent = {topic for topic, source in self._inputs.items()
                   if now - max(source.newest, self._begun) > SILENT_SECONDS and (
                       self._max_age_s[topic] < math.inf
                       or not source.count and topic in self._expected)}
         types: dict[str, Any] = {
             one.topic_name: one.msg_type for one in list(self._node.subscriptions)}
+        cameras = {topic: found for topic, age in self._max_age_s.items()
+                   if age < math.inf and types.get(topic) in CAMERA_TYPES
+                   and (found := rivals(self._node, [topic]))}
+        for topic in sorted(cameras.keys() - self._shared):
+            self._node.get_logger().warning(f'{escaped(cameras[topic])}; leave one of them')
+        self._shared = {*cameras}
         for topic in sorted(silent - self._told):
             why = why_silent(self._node, topic, types.get(topic))
             self._node.get_logger().warning(
@@ -163,6 +172,6 @@ class Diagnostics:
     def _status(self, name: str, level: bytes, text: str,
                 values: Mapping[str, Any]) -> DiagnosticStatus:
         return DiagnosticStatus(
-            name=f'{self._node.get_name()}: {name}', level=level, message=text,
+            name=f'{self._node.get_fully_qualified_name()[1:]}: {name}', level=level, message=text,
             hardware_id=self._node.get_fully_qualified_name(),
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])

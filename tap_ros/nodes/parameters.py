@@ -21,7 +21,9 @@ from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
 from tap_ros.plugins import names
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
+from tap_ros.text import listing
 
+FARTHEST = 100.0  # m; no camera is there
 # Of several nodes: default, description, and what else Parameters.declare takes.
 SHARED: dict[str, tuple[Any, str, dict[str, Any]]] = {
     'autostart': (
@@ -124,7 +126,7 @@ class Parameters:
         """Declare the pose of the camera in a frame, and what counts of its camera_info."""
         for axis in 'xyz':
             self.declare(f'camera_{axis}', 0.0, f'{axis} of the camera in {frame}, m.',
-                         low=-100.0, high=100.0)
+                         low=-FARTHEST, high=FARTHEST)
         for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
             self.declare(
                 f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
@@ -137,14 +139,14 @@ class Parameters:
         """
         Return the pose (4, 4) of the camera, by the parameters of declare_camera.
 
-        :raises ConfigError: for a quaternion of length 0.
+        :raises ConfigError: for a quaternion of length 0, and for numbers of no pose.
         """
         place, quaternion = ([self[f'camera_{axis}'] for axis in axes]
                              for axes in ('xyz', ('qx', 'qy', 'qz', 'qw')))
         try:
             return pose_matrix(place, quaternion)
         except ConfigError as error:
-            raise ConfigError(f'parameters camera_qx to camera_qw: {error}') from error
+            raise ConfigError(f'parameters camera_x to camera_qw: {error}') from error
 
     def _check_choices(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse strings that are none of the choices."""
@@ -173,9 +175,12 @@ def pose_matrix(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarr
     """
     Return a pose (4, 4) of a place (3,), m, and a quaternion x, y, z, w of any length.
 
-    :raises ConfigError: for a quaternion of length 0.
+    :raises ConfigError: for a quaternion of length 0, and for numbers of no pose.
     """
     from scipy.spatial.transform import Rotation  # later, since not every node needs it
+    if not (np.abs([*place, *quaternion]) <= FARTHEST).all():
+        raise ConfigError(f'a pose of {listing([*place, *quaternion])}; expected numbers up to '
+                          f'{FARTHEST:g}')
     if not np.linalg.norm(quaternion) > 0.1:
         raise ConfigError('a quaternion of no direction')
     pose = np.eye(4)

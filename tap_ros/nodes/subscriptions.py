@@ -10,6 +10,7 @@ for what its publishers offer.
 from collections.abc import Callable, Iterable, Mapping
 import copy
 from difflib import get_close_matches
+from types import MappingProxyType
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -122,12 +123,16 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], object],
                              clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, dict[bytes, str]]:
-    """Return {topic: {participant: node}} of topics of which there may be but one publisher."""
-    return {topic: {
-        bytes(info.endpoint_gid[:12]): info.node_name  # known before all topics of a node
-        for info in node.get_publishers_info_by_topic(topic)}
-        for topic in map(node.resolve_topic_name, topics)}
+def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, dict[bytes, set[str]]]:
+    """Return {topic: {participant: nodes}} of topics of which there may be but one publisher."""
+    found: dict[str, dict[bytes, set[str]]] = {}
+    for topic in map(node.resolve_topic_name, topics):
+        publishers = found.setdefault(topic, {})
+        for info in node.get_publishers_info_by_topic(topic):
+            # The participant is known before all topics and nodes of it.
+            publishers.setdefault(bytes(info.endpoint_gid[:12]), set()).add(
+                f'{info.node_namespace.rstrip("/")}/{info.node_name}')
+    return found
 
 
 def publishers_beside(node: Node, topic: str) -> list[str]:
@@ -140,17 +145,19 @@ def publishers_beside(node: Node, topic: str) -> list[str]:
     return sorted(names)
 
 
-def rivals(node: Node, topics: Iterable[str], known: Mapping[str, Mapping[bytes, str]]) -> str:
+def rivals(node: Node, topics: Iterable[str],
+           known: Mapping[str, Mapping[bytes, set[str]]] = MappingProxyType({})) -> str:
     """
-    Say how many publish a topic where one of them, such as a second camera, is new; else ''.
+    Say who publish a topic where several do and one, such as a second camera, is new; else ''.
 
-    :param known: what publishers_of returned before.
+    :param known: what publishers_of returned before; by default all are new.
     """
     before: set[bytes] = set().union(*known.values())
     for topic, publishers in publishers_of(node, topics).items():
-        if len(publishers) > 1 and publishers.keys() - before:
-            return (f'{len(publishers)} nodes publish on {topic} now, '
-                    f'{listing(sorted(publishers.values()))}')
+        nodes = [name for names in publishers.values()
+                 for name in {one for one in names if UNKNOWN not in one} or names]
+        if len(nodes) > 1 and publishers.keys() - before:
+            return f'{len(nodes)} nodes publish on {topic}, {listing(sorted(nodes))}'
     return ''
 
 
@@ -168,7 +175,8 @@ def why_silent(node: Node, topic: str, message_type: type | None) -> str:
         return ''
     offered = {name: {one.topic_type for one in node.get_publishers_info_by_topic(name)
                       if one.node_name not in {node.get_name(), UNKNOWN, *OURS}}
-               for name, _ in node.get_topic_names_and_types() if name != topic}
+               for name, _ in node.get_topic_names_and_types()
+               if name != topic and not _of_another_robot(node, name)}
     if here:
         why = f'what is published there is {listing(sorted(here))}; expected {kind}'
     else:
@@ -183,6 +191,19 @@ def why_silent(node: Node, topic: str, message_type: type | None) -> str:
         return f'{why}; {start} -r {escaped(other)}:={escaped(topic)}'
     alike = sorted(name for name, kinds in offered.items() if kind in kinds and not any(
         one.is_called(name) and not one.is_called(topic) for one in TOPICS))
-    alike = alike or get_close_matches(topic, [name for name in offered if offered[name]], 3, 0.7)
+    if not kind:
+        alike = get_close_matches(topic, [name for name in offered if offered[name]], 3, 0.7)
     return why if not alike else (
         f'{why}; published are {listing(alike, 5)}: remap one, -r {topic}:={escaped(alike[0])}')
+
+
+def _of_another_robot(node: Node, topic: str) -> bool:
+    """Return whether a topic is in a namespace where other nodes of this package are."""
+    own = node.get_namespace().rstrip('/')
+    spaces = {space for name, space in node.get_node_names_and_namespaces()
+              if name in NODE_CLASSES and space != '/'}
+    if own:  # what has our name elsewhere, but for the root, is another robot's, too
+        plain = topic.removesuffix('/compressed')
+        spaces |= {plain.removesuffix(f'/{one.name}') for one in TOPICS if one.is_called(topic)}
+    return any(space and topic.startswith(f'{space}/') and not f'{own}/'.startswith(f'{space}/')
+               for space in spaces)

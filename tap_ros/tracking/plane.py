@@ -9,10 +9,13 @@ the camera's size is.
 
 import numpy as np
 from numpy.typing import ArrayLike
+from tap_ros.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
 
 SIDE = 256
 TOP, MIDDLE = 0.06, 0.03  # m above the table: what most of a silhouette shows, and its middle
+STEEP = 0.1  # sine of the angle at which a camera looks down on the middle of the table, at least
+EDGE = 0.47  # m, |x| and |y| on a calibrated table
 PIXELS_A_METRE = 160.0  # without calibration, in the working picture
 
 
@@ -75,6 +78,11 @@ class Plane:
         """Return the working pixels (..., 2) of the middles of objects at places."""
         return project(self._middle, places)
 
+    def apart(self, other: 'Plane') -> float:
+        """Return how far corners of the table are from those of another plane, working px."""
+        corners = np.array([(x, y) for x in (-EDGE, EDGE) for y in (-EDGE, EDGE)])
+        return float(np.abs(self.top_pixels(corners) - other.top_pixels(corners)).max())
+
     def rise(self, place: np.ndarray) -> np.ndarray:
         """Return the working pixels (2,) from the table at a place up to a top; 0 if unknown."""
         return project(self.top, place) - project(self._base, place)
@@ -83,6 +91,21 @@ class Plane:
         """Return the direction (2,) on the table in which the sides of an object are seen."""
         down = self.of_top(self.top_pixels(place) - self.rise(place)) - place
         return down / max(float(np.linalg.norm(down)), 1e-9)
+
+
+def check_pose(pose: np.ndarray) -> None:
+    """
+    Refuse a camera from which places on the table cannot be told.
+
+    :param pose: (4, 4) of the camera in the frame of the table.
+    :raises TrackingError: unless it looks down on the middle of the table.
+    """
+    at = pose[:3, 3] - (0, 0, TOP)
+    if not (-at @ pose[:3, 2] > 0 and at[2] > STEEP * np.linalg.norm(at)):
+        raise TrackingError(
+            'a camera at ({:g}, {:g}, {:g}) m that looks along ({:.2g}, {:.2g}, {:.2g}) does not '
+            'look down on the middle of the table, (0, 0, 0); correct its pose'.format(
+                *pose[:3, 3], *pose[:3, 2]))
 
 
 def project(matrix: np.ndarray, points: ArrayLike) -> np.ndarray:

@@ -49,8 +49,8 @@ class Tracker(Protocol):
 
         :param pixels: (K, 2), a click on each object.
         :return: each at the middle of its silhouette.
-        :raises TrackingError: for a click outside the picture, on the robot, or on nothing that
-            differs from the table; then those before are followed on.
+        :raises TrackingError: for a click outside the picture, on the robot, beyond the table,
+            or on nothing that differs from it; then those before are followed on.
         """
 
     def update(self, view: View) -> Tracked:

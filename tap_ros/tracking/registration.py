@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from tap_ros.tracking.picture import Palette, Picture
-from tap_ros.tracking.plane import Plane
+from tap_ros.tracking.plane import EDGE, Plane
 from tap_ros.tracking.protocols import LOST, SEEN, Tracked, View
 from tap_ros.tracking.silhouette import centre, silhouette
 from tap_ros.tracking.template import Matcher, Pose, Template
@@ -20,10 +20,10 @@ LEAST_SURE = 0.9  # confidence, else not found
 CHANGED = 8.0  # distance of colours
 LEAST_CHANGED = 60  # px of the working picture
 KEPT = 0.1  # weight of places where nothing changed
+MOST_TRIED = 32  # changes, the largest ones, where an object may have been
 PLACES = 6  # that are tried
 TRIED = 4  # turns at each of them that are tried finely
 APART = 0.035  # m from other objects
-EDGE = 0.47  # m, |x| and |y| on a calibrated table
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.5)
 _TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
 _AROUND = np.stack(np.meshgrid(*[np.linspace(-0.03, 0.03, 5)] * 2), -1).reshape(-1, 2)  # m
@@ -141,7 +141,7 @@ def propose(start: View, goal: View) -> np.ndarray:
                                np.ones((3, 3), np.uint8))
     count, labels, stats, centres = cv2.connectedComponentsWithStats(changed)
     found: list[tuple[int, np.ndarray]] = []
-    for i in np.argsort(-stats[1:, cv2.CC_STAT_AREA]) + 1:
+    for i in np.argsort(-stats[1:, cv2.CC_STAT_AREA])[:MOST_TRIED] + 1:
         if stats[i, cv2.CC_STAT_AREA] < LEAST_CHANGED:
             break
         part = labels == i
@@ -158,4 +158,4 @@ def propose(start: View, goal: View) -> np.ndarray:
         if mask.any() and not any(np.hypot(*(centre(mask) - other)) < 8 for _, other in found):
             found.append((int(mask.sum()), centre(mask)))
     found.sort(key=lambda one: -one[0])
-    return plane.enlarge([at for _, at in found]).reshape(-1, 2)
+    return plane.enlarge(np.reshape([at for _, at in found], (-1, 2)))

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from tap_ros.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.picture import Picture
-from tap_ros.tracking.plane import Plane, TOP
+from tap_ros.tracking.plane import EDGE, Plane, TOP
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
 from tap_ros.tracking.registration import locate, mean_shift, register
 from tap_ros.tracking.silhouette import clicked, middle, RADIUS, silhouette, top_face
@@ -83,6 +84,9 @@ class RigidTracker:
             name = 'click ' + str(tuple(round(float(x), 1) for x in plane.enlarge(click)))
             mask = clicked(picture, click, np.delete(clicks, k, 0), name)
             place = middle(mask, plane) if self._snap else plane.of_middle(click)
+            if plane.calibrated and not (np.abs(place) < EDGE).all():
+                raise TrackingError(f'{name} is on nothing within {EDGE:g} m of the middle of the '
+                                    'table, along x and y; click on an object')
             face = top_face(mask, plane)
             objects.append(_Object(
                 place, [Template(picture, plane, mask, place)],

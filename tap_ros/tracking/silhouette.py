@@ -16,8 +16,9 @@ COMMON = 0.12  # share of the ring around that a colour of the table has at leas
 SHADES = (1.0, 0.5)  # of the table's light, in shadows of objects
 LIKELY, POSSIBLE, SURE = 12.0, 6.0, 25.0  # from the table's colours, of what may be the object
 FLAT = 0.3  # share of a silhouette that is its top at least, else the object is not upright
-LEAST_AREA = 25  # px
+LEAST_AREA = 64  # px; more than CORE, which is taken for the object whatever it shows
 LEAST_CONTRAST = 7.0  # of the object's colours and the table's, for a click to be believed
+SPREAD = 1.5  # by which it exceeds what colours of the ring differ from the table's, median
 _RINGS = (0.75, 1.3)  # of RADIUS, between which the table is seen
 
 
@@ -31,7 +32,7 @@ def silhouette(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray] = 
     :param at: (2,) (u, v) in the working picture.
     :param others: pixels of other objects.
     :return: (h, w) bool, all False where nothing differs; and how its colours differ from those
-        around it, median.
+        around it, median; 0 where those differ as much among themselves.
     """
     h, w = picture.size
     u, v = at
@@ -82,7 +83,8 @@ def silhouette(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray] = 
     empty[window] = found
     if not empty.any():
         return empty, 0.0
-    return empty, float(np.median(unlike[found > 0]))
+    contrast = float(np.median(unlike[found > 0]))
+    return empty, contrast if contrast > SPREAD * np.median(unlike[ring]) else 0.0
 
 
 def shaded(colours: np.ndarray, share: float) -> np.ndarray:

@@ -10,6 +10,7 @@ import pytest
 from sensor_msgs.msg import CompressedImage, Image, JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+from tap_msgs.msg import ObjectStates
 from tap_ros.nodes import diagnostics
 from tap_ros.nodes.calls import call
 from tap_ros.nodes.diagnostics import Diagnostics, Record
@@ -29,6 +30,7 @@ def test_what_is_published_instead_and_the_remedy_are_named():
             (JointState, '/joint_states', {f'/{side}/joint_states': JointState
                                            for side in ('left', 'right')},
              ['/left/joint_states, /right/joint_states', ':=/left/joint_states']),
+            (ObjectStates, '/goal/objects', {'/goal/object': Image}, ['no node publishes it']),
             (None, eye, {'/eye/image_ra': String}, ['no node publishes it', '/eye/image_ra'])):
         with (Client('camera') as camera, Client('looking') as node,
               Client('visual_mpc_node') as ours):
@@ -42,9 +44,50 @@ def test_what_is_published_instead_and_the_remedy_are_named():
             assert until(fits, 10), (published, why_silent(node, topic, kind))
             assert f'{topic}:={topic}' not in why_silent(node, topic, kind)
             assert until(lambda node=node: node.count_publishers('/a/plan'))
-            assert not {'/goal/image', '/a/plan'} & set(
+            there = next(iter(published.items()))
+            assert until(lambda node=node, there=there: why_silent(node, *there) == '')
+            assert not {'/goal/image', '/goal/object', '/a/plan'} & set(
                 why_silent(node, topic, kind).replace(',', ' ').replace(':', ' ').split())
-            assert why_silent(node, next(iter(published)), next(iter(published.values()))) == ''
+
+
+def test_what_one_robot_is_told_names_nothing_of_another(client):
+    topics = ('/b/camera/image_raw', '/b/camera/image_raw/compressed', '/b/wrist/image', '/image')
+    kinds = (Image, CompressedImage, Image, Image)
+    with (Client('tracker_node', namespace='/a') as node,
+          Client('predictor_node', namespace='/b')):
+        for kind, topic in zip(kinds, topics):
+            client.create_publisher(kind, topic, STREAM)
+        newest = Newest(client, DiagnosticArray, '/diagnostics', 10)
+        Diagnostics(node, ['camera/image_raw'])
+        told = newest.wait(10, lambda message: message.status[0].hardware_id == '/a/tracker_node')
+        assert {status.name for status in told.status} == {
+            'a/tracker_node: service', 'a/tracker_node: /a/camera/image_raw'}
+
+        def why():
+            return why_silent(node, '/a/camera/image_raw', Image)
+
+        assert until(lambda: ':=/image' in why())
+        assert until(lambda: node.count_publishers('/b/wrist/image'))
+        assert until(lambda: ('predictor_node', '/b') in node.get_node_names_and_namespaces())
+        assert '/b/' not in why()
+
+
+def test_cameras_that_share_a_topic_are_named_once(client, hurried, capfd):
+    node = LocalNode(RecorderNode, topics=['camera/image_raw'], record_on_start=False)
+    try:
+        with Client('left_eye') as left, Client('right_eye') as right:
+            for camera in (left, right):
+                camera.create_publisher(Image, 'camera/image_raw', STREAM)
+            said = []
+
+            def named():
+                said.append(capfd.readouterr().err)
+                return ''.join(said).count(
+                    '2 nodes publish on /camera/image_raw, /left_eye, /right_eye')
+            assert until(named) == 1
+            assert not until(lambda: named() > 1, 2.5, pause=0.1)
+    finally:
+        assert node.end() == 0
 
 
 @pytest.fixture

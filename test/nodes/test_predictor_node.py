@@ -155,6 +155,17 @@ def test_a_picture_whose_robot_mask_is_missing_is_refused(services):
     assert until(refused)
 
 
+def test_pictures_of_two_cameras_are_refused_unless_one_is_sent_along(client, services):
+    service = services['plain']
+    with Client('left_eye') as left, Client('right_eye') as right:
+        for camera in (left, right):
+            camera.create_publisher(Image, '/plain/camera/image_raw', STREAM)
+        assert until(lambda: client.count_publishers('/plain/camera/image_raw') > 1)
+        message = service.refusal(goal=GOAL)
+        assert '2 nodes publish on /plain/camera/image_raw, /left_eye, /right_eye' in message
+        service.answer(**WITH_GOAL)
+
+
 def test_many_requests_at_once_get_their_own_answer_and_beyond_the_queue_busy(services):
     latent = services['latent']
     alone = [pictures(latent.answer(seed=seed, **WITH_GOAL)) for seed in range(8)]

@@ -6,7 +6,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 from made_bags import decode_gripper
 import numpy as np
-from processes import LocalNode, Newest, NodeProcess, until
+from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
@@ -101,6 +101,34 @@ def test_without_a_robot_or_its_joints_there_is_no_mask_and_the_reason(client):
             diagnostics.wait(30, tells_why)
         finally:
             node.end()
+
+
+def test_of_two_cameras_and_of_what_fails_there_is_no_mask_and_the_reason(client, capfd):
+    diagnostics = Newest(client, DiagnosticArray, '/diagnostics', 10)
+    node = LocalNode(RobotMaskNode, '/pair', **CAMERA, urdf='ur10e')
+    camera = encode_camera_info(np.eye(3), (64, 64), to_stamp(10**9), 'eye')
+
+    def told(words):
+        return diagnostics.wait(30, lambda message: any(
+            words in pair.value for status in message.status for pair in status.values))
+
+    try:
+        with Client('left_eye') as left, Client('right_eye') as right:
+            publishers = [one.create_publisher(CameraInfo, '/pair/camera/camera_info', STREAM)
+                          for one in (left, right)]
+            left.create_timer(0.1, lambda: publishers[0].publish(camera))
+            told('2 nodes publish on /pair/camera/camera_info, /left_eye, /right_eye')
+        assert until(lambda: not client.count_publishers('/pair/camera/camera_info'))
+        assert until(lambda: not node.node._waiting)
+        cameras = client.create_publisher(CameraInfo, '/pair/camera/camera_info', STREAM)
+        assert until(cameras.get_subscription_count)
+        node.node._history.at = lambda *_: 1 / 0
+        cameras.publish(camera)
+        told('division by zero')
+        assert until(lambda: not node.node._waiting)
+    finally:
+        assert not node.end()
+    assert capfd.readouterr().err.count('ZeroDivisionError') == 1
 
 
 def test_a_bad_start_names_the_parameter():

@@ -3,24 +3,26 @@
 """tracker_node: objects of the stamp of each picture after a click on each, or the reason."""
 
 import json
+import math
 from threading import Event
 import time
 
 from driven import SEED, select
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped
 import numpy as np
-from processes import LocalNode, Newest, NodeProcess, until
+from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
-from sensor_msgs.msg import Image, JointState
+from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates
 import tap_ros
 from tap_ros.contract import CONTROL_PERIOD
+from tap_ros.errors import TapError
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import positions_of
 from tap_ros.nodes.explorer.node import ExplorerNode
-from tap_ros.nodes.ros_messages import encode_image, encode_joints
+from tap_ros.nodes.ros_messages import encode_camera_info, encode_image, encode_joints
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.nodes.tracker.node import TrackerNode
 from websockets.sync.client import connect
@@ -113,7 +115,7 @@ def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(
     first, second = clicks.values()
     for asked, words in (
             ({'names': ['a'], 'u': [first[0]], 'v': []}, '1, 1 and 0 entries'),
-            ({'names': [], 'u': [], 'v': []}, 'at least one'),
+            ({'names': [], 'u': [], 'v': []}, 'as many of each, 1 to'),
             ({'names': ['a', 'a'], 'u': [first[0], second[0]], 'v': [first[1], second[1]]},
              'a name of its own'),
             ({'names': ['a' * 200], 'u': [first[0]], 'v': [first[1]]}, 'characters'),
@@ -125,68 +127,219 @@ def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(
     assert set(names) == set(clicks)
 
 
-def test_a_picture_waits_for_its_joints_as_long_as_it_is_told_to(client):
-    node = LocalNode(TrackerNode, '/late', robot_mask='none', patience=60.0)
-    images, joints = (client.create_publisher(kind, f'/late/{topic}', STREAM) for kind, topic in (
-        (Image, 'camera/image_raw'), (JointState, 'joint_states')))
-    followed = Newest(client, ObjectStates, '/late/objects', STREAM)
-    picture = np.full((SIZE, SIZE, 3), 90, np.uint8)
-    picture[40:60, 50:80] = 200, 40, 40
+class Eye:
+    """A tracker in a namespace of its own, and a camera that shows it a red block on a table."""
 
-    def send(kind, second):
-        stamp = to_stamp(second * 10**9)
-        kind.publish(encode_image(picture, stamp, 'eye') if kind is images else
-                     encode_joints(np.zeros(4), stamp, 'world'))
+    def __init__(self, client, name, **parameters):
+        self.name, self._client = name, client
+        self.node = LocalNode(TrackerNode, f'/{name}', robot_mask='none', **parameters)
+        self._publishers = {}
+        self.objects = []
+        client.create_subscription(
+            ObjectStates, f'/{name}/objects', self.objects.append, STREAM)
 
-    try:
-        assert until(lambda: images.get_subscription_count() and joints.get_subscription_count())
-        send(joints, 1)
-        send(images, 1)
-        with tap_ros.Client('/late') as user:
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        assert self.node.end() == 0
+
+    def send(self, topic, message, qos=STREAM):
+        """Publish a message once the tracker listens."""
+        if topic not in self._publishers:
+            made = self._client.create_publisher(type(message), f'/{self.name}/{topic}', qos)
+            self._publishers[topic] = made
+            assert until(made.get_subscription_count)
+        self._publishers[topic].publish(message)
+
+    def picture(self, second, block=True, size=SIZE, topic='camera/image_raw', qos=STREAM):
+        """Show a picture of a stamp."""
+        picture = np.full((size, size, 3), 90, np.uint8)
+        if block:
+            picture[40:60, 50:80] = 200, 40, 40
+        self.send(topic, encode_image(picture, to_stamp(second * 10**9), 'eye'), qos)
+
+    def goal(self, second, block=True):
+        """Show a goal picture."""
+        self.picture(second, block, topic='goal/image', qos=LATCHED)
+
+    def begin(self, second):
+        """Mark the begin of an episode, and wait until it is known."""
+        mark, before = Episode(event=Episode.START), self.node.node._begun
+        mark.header.stamp = to_stamp(second * 10**9)
+        self.send('episode', mark)
+        assert until(lambda: self.node.node._begun != before)
+
+    def calibrate(self, place=(0.0, -1.1, 1.3), turn=(0.94, 0.0, 0.0, -0.34), focal=140.0):
+        """Tell where the camera is, and how it sees."""
+        self.send('camera/camera_info', encode_camera_info(
+            np.array([[focal, 0, 63.5], [0, focal, 63.5], [0, 0, 1]]), (SIZE, SIZE), to_stamp(1),
+            'eye'))
+        pose = PoseStamped()
+        for field, values in ((pose.pose.position, place), (pose.pose.orientation, turn)):
+            for axis, value in zip('xyzw', values):
+                setattr(field, axis, value)
+        self.send('camera/pose', pose, LATCHED)
+        node = self.node.node
+        assert until(lambda: repr(node._told) == repr(pose) and node._info is not None)
+
+    def ask(self, **fields):
+        """Call select_objects once a picture has come; return why it refuses, else ''."""
+        assert until(lambda: self.node.node._sensors.newest('image'))
+        with tap_ros.Client(f'/{self.name}') as user:
+            try:
+                user.call('select', **fields)
+            except CallError as error:
+                return str(error)
+        return ''
+
+    def select(self):
+        """Click on the block."""
+        with tap_ros.Client(f'/{self.name}') as user:
             select(user, {'red': (65, 50)})
-        followed.wait(10)
-        send(images, 2)
+        assert until(lambda: self.objects)
+
+    def followed(self, second):
+        """Return the states of the objects in a picture; it has to be followed."""
+        def found():
+            return [one for one in self.objects if one.header.stamp.sec == second]
+        assert until(found, 10)
+        return list(found()[0].states)
+
+
+def test_a_picture_waits_for_its_joints_as_long_as_it_is_told_to(client):
+    def joints(second):
+        return encode_joints(np.zeros(4), to_stamp(second * 10**9), 'world')
+
+    with Eye(client, 'late', patience=60.0) as eye:
+        eye.send('joint_states', joints(1))
+        eye.picture(1)
+        eye.select()
+        eye.picture(2)
         time.sleep(1)
-        assert followed.count == 1
-        send(joints, 2)
-        followed.wait(10, lambda m: m.header.stamp.sec == 2)
-    finally:
-        assert node.end() == 0
+        assert len(eye.objects) == 1
+        eye.send('joint_states', joints(2))
+        eye.followed(2)
+
+
+def test_an_object_that_is_unsure_and_seen_again_is_told_of_once(client, capfd):
+    with Eye(client, 'unsure') as eye:
+        eye.picture(1)
+        eye.select()
+        for second, block in enumerate((True, False, True, True), 2):
+            eye.picture(second, block)
+            assert eye.followed(second) == ['seen' if block else 'unsure']
+        assert len(eye.objects) == 5
+    lines = capfd.readouterr().err.splitlines()
+    assert [line.split()[0] for line in lines if 'red is' in line] == ['[WARN]', '[INFO]']
+    assert not [line for line in lines if 'Traceback' in line or '[ERROR]' in line]
+
+
+def test_what_cannot_be_followed_costs_one_picture(client):
+    with Eye(client, 'costly') as eye:
+        eye.picture(1)
+        eye.select()
+        tracker, tried = eye.node.node._selection.tracker, []
+        update = tracker.update
+
+        def fail(view):
+            tried.append(view)
+            raise ValueError('a plug-in has a mistake')
+
+        tracker.update = fail
+        eye.picture(2)
+        assert until(lambda: tried)
+        eye.picture(2)  # sent again
+        time.sleep(0.5)
+        assert len(tried) == 1 and {one.header.stamp.sec for one in eye.objects} == {1}
+        tracker.update = update
+        eye.picture(3)
+        assert eye.followed(3) == ['seen']
+
+
+def test_requests_of_no_use_are_refused_with_the_remedy(client):
+    with Eye(client, 'asked') as eye, Client('second_eye') as other:
+        eye.picture(1)
+        count = 10**6
+        assert f'{count} entries' in eye.ask(
+            names=['a'] * count, u=[1.0] * count, v=[1.0] * count)
+        eye.goal(1)
+        assert 'shows nothing elsewhere; click' in eye.ask(propose=True)
+        for place, turn in (((0.0, 0.0, math.nan), (1.0, 0.0, 0.0, 0.0)),
+                            ((0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 0.0)),
+                            ((0.0, -1.0, 0.06), (0.7, 0.0, 0.0, -0.7)),  # level, at a top's height
+                            ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))):  # looks up
+            eye.calibrate(place, turn)
+            why = eye.ask(names=['a'], u=[65.0], v=[50.0])
+            assert why.startswith('camera/pose: ') or ': camera/pose: ' in why
+        eye.calibrate()
+        with pytest.raises(TapError, match='does not look down'):
+            LocalNode(TrackerNode, camera_z=0.06, camera_y=-1.0, camera_qx=0.7, camera_qw=-0.7)
+        other.create_publisher(Image, '/asked/camera/image_raw', STREAM)
+        assert until(lambda: client.count_publishers('/asked/camera/image_raw') == 2)
+        why = eye.ask(names=['a'], u=[65.0], v=[50.0])
+        assert '/test_client, /second_eye' in why or '/second_eye, /test_client' in why
+
+
+@pytest.mark.parametrize('change, words', [
+    ({'size': 64}, '64x64 pixels now, and had 128x128'),
+    ({'focal': 150.0}, 'camera/camera_info or camera/pose has changed'),
+    ({'place': (0.1, -1.1, 1.3)}, 'camera/camera_info or camera/pose has changed')])
+def test_pictures_of_another_camera_end_the_selection(client, capfd, change, words):
+    with Eye(client, 'moved') as eye:
+        eye.calibrate()
+        eye.picture(1)
+        eye.select()
+        if 'size' not in change:
+            eye.calibrate(**change)
+        for second in (2, 3):
+            eye.picture(second, size=change.get('size', SIZE))
+        assert until(lambda: eye.node.node._selection is None)
+        assert {one.header.stamp.sec for one in eye.objects} == {1}
+    said = capfd.readouterr().err
+    assert said.count(words) == said.count('are forgotten') == 1
+
+
+@pytest.mark.parametrize('early', [True, False])
+def test_a_mark_of_another_clock_does_not_lock_the_service(client, early):
+    with Eye(client, 'marked') as eye:
+        eye.goal(1)
+        if early:
+            eye.begin(2**31 - 1)  # in 2038
+        eye.picture(1)
+        if not early:
+            eye.select()
+            eye.begin(2**31 - 1)
+            assert until(lambda: eye.node.node._selection is None)
+            assert 'no picture of the new episode' in eye.ask(names=['a'], u=[65.0], v=[50.0])
+            eye.picture(2)
+        told = Newest(client, ObjectStates, '/marked/goal/objects', LATCHED)
+        eye.select()
+        told.wait(10, lambda message: message.objects)
 
 
 def test_what_is_searched_in_a_goal_is_not_told_if_a_scene_begins_meanwhile(client):
-    node = LocalNode(TrackerNode, '/searching', robot_mask='none')
-    images, goals, marks = (
-        client.create_publisher(kind, f'/searching/{topic}', qos) for kind, topic, qos in (
-            (Image, 'camera/image_raw', STREAM), (Image, 'goal/image', LATCHED),
-            (Episode, 'episode', STREAM)))
     told, searching = [], Event()
-    client.create_subscription(ObjectStates, '/searching/goal/objects', told.append, LATCHED)
-    picture = np.full((SIZE, SIZE, 3), 90, np.uint8)
-    picture[40:60, 50:80] = 200, 40, 40
-
-    def slow(view):
-        searching.set()
-        until(lambda: node.node._begun[0] == 5 * 10**9, 5)
-        return find(view)
-
-    try:
-        assert until(lambda: images.get_subscription_count() and marks.get_subscription_count())
-        images.publish(encode_image(picture, to_stamp(10**9), 'eye'))
-        goals.publish(encode_image(picture, to_stamp(10**9), 'eye'))
-        with tap_ros.Client('/searching') as user:
-            select(user, {'red': (65, 50)})
+    with Eye(client, 'searching') as eye:
+        client.create_subscription(
+            ObjectStates, '/searching/goal/objects', told.append, LATCHED)
+        eye.picture(1)
+        eye.goal(1)
+        eye.select()
         assert until(lambda: told and told[-1].objects)
-        find = node.node._selection.tracker.find
-        node.node._selection.tracker.find = slow
-        goals.publish(encode_image(picture, to_stamp(5 * 10**9), 'eye'))
+        tracker = eye.node.node._selection.tracker
+        find = tracker.find
+
+        def slow(view):
+            searching.set()
+            until(lambda: eye.node.node._begun[0] == 5 * 10**9, 5)
+            return find(view)
+
+        tracker.find = slow
+        eye.goal(5)
         assert searching.wait(10)
-        mark = Episode(event=Episode.START)
-        mark.header.stamp = to_stamp(5 * 10**9)
-        marks.publish(mark)
+        eye.begin(5)
         assert until(lambda: not told[-1].objects)
-    finally:
-        assert node.end() == 0
     assert {one.header.stamp.sec for one in told} == {1}
 
 

@@ -96,3 +96,16 @@ def test_at_the_end_all_that_wait_are_told_and_the_batch_is_finished(made):
     ending.join(TIMEOUT)
     assert not ending.is_alive()
     assert rig.wait(4)[0] == 0 and len(rig.answers) == 4
+
+
+def test_work_that_answers_too_few_leaves_nobody_without_an_answer(made):
+    rig = made(lambda batch: [-one for one in batch][:1])
+    rig.hold()
+    for one in (1, 2, 3):
+        rig.put(one)
+    rig.go.set()
+    assert rig.wait(4) == {0: 0, 1: -1, 2: -2, 3: -3}  # each alone
+    rig = made(lambda batch: [])
+    rig.go.set()
+    rig.put(1)
+    assert '0 answers to 1 requests' in str(rig.wait(1)[1])

@@ -2,13 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of following clicked objects, on pictures of one drawn table."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from sim_bridge.simulator import Simulator
+from sim_bridge.world.looks import LOOKS
 from tap_ros.errors import TrackingError
 from tap_ros.plugins import load_plugin
+from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.tracking.plane import check_pose, TOP
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, UNSURE, View
 from tap_ros.tracking.registration import propose
 
@@ -123,3 +128,48 @@ def test_objects_are_found_in_a_goal_picture_or_refused(tracker):
 def test_what_moved_from_one_picture_to_another_is_proposed():
     found = propose(draw(STARTS, robot=(0, 0, 40, 60)), draw((STARTS[0], (120.0, 220.0))))
     assert len(found) == 1 and np.abs(found - STARTS[1:]).max() < 2
+    assert propose(draw(STARTS), draw(STARTS)).shape == (0, 2)
+
+
+@pytest.mark.parametrize('noise', [8, 16, 30])
+def test_noise_is_no_object(noise):
+    picture = table() + np.random.default_rng(0).normal(0, noise, (SIZE, SIZE, 3))
+    view = View(picture.clip(0, 255).astype(np.uint8))
+    for click in np.random.default_rng(1).uniform(0, SIZE - 1, (10, 2)):
+        with pytest.raises(TrackingError, match='on nothing that differs'):
+            load_plugin('tap_ros.trackers', 'rigid')(None).select(view, [click])
+
+
+@pytest.mark.parametrize('look', LOOKS)
+def test_what_a_click_selects_has_an_object_under_it(look):
+    """Wherever one clicks: table, its rim, its shadows, what is behind it."""
+    simulator, selected = Simulator('push2', 128, look=look, appearance='random'), 0
+    try:
+        for seed in range(2):
+            seen = simulator.reset(seed)
+            view = View(seen.image, seen.robot_mask)
+            camera = PinholeCamera(
+                simulator.camera_matrix, seen.image.shape[:2], simulator.camera_pose)
+            true = seen.object_pixels
+            tracker = load_plugin('tap_ros.trackers', 'rigid')(camera)
+            beside = np.repeat(true, 4, 0) + 9 * np.array([(0, 1), (1, 0), (0, -1), (-1, 0)] * 2)
+            for click in (*np.random.default_rng(seed).uniform(0, 127, (30, 2)), *beside, *true):
+                with suppress(TrackingError):
+                    found, = tracker.select(view, [click]).pixels
+                    assert np.linalg.norm(true - found, axis=1).min() < 8, click
+                    selected += 1
+    finally:
+        simulator.close()
+    assert selected > 4
+
+
+@pytest.mark.parametrize('place, along', [
+    ((0, -1, TOP), (0, 1, 0)), ((0, 0, 1), (0, 0, 1)), ((0, -1, 0.1), (0, 1, 0)),
+    ((0, 0, -1), (0, 0, 1)), ((90, 0, 1), (0, 0, -1))])
+def test_a_camera_that_does_not_look_down_on_the_table_is_refused(place, along):
+    pose = np.eye(4)
+    pose[:3, 2], pose[:3, 3] = along, place
+    with pytest.raises(TrackingError, match='does not look down'):
+        check_pose(pose)
+    pose[:3, 2:] = np.array([(0, 0.8, -0.6), (0, -1.1, 1.3)]).T
+    check_pose(pose)

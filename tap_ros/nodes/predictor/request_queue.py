@@ -101,7 +101,10 @@ class RequestQueue(Generic[Request, Answer]):
     def _answers(self, requests: list[Request]) -> Iterable[Answer | Exception]:
         """Yield the answers of a batch, in its order; an exception stands for one that failed."""
         try:
-            return self._work(requests) if requests else []
+            found = list(self._work(requests)) if requests else []
+            if len(found) != len(requests):
+                raise RuntimeError(f'{len(found)} answers to {len(requests)} requests')
+            return found
         except Exception as error:
             if len(requests) == 1:
                 return [error]

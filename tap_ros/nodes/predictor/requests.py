@@ -26,6 +26,7 @@ from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.robot_view import RobotView
 from tap_ros.nodes.ros_messages import encode_subgoal
+from tap_ros.nodes.subscriptions import rivals
 from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, STREAM
 from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.protocol import Predictor, Question
@@ -82,7 +83,9 @@ class RequestReader:
 
     def __init__(self, node: Node, params: Parameters,
                  on_message: Callable[[str], object]) -> None:
-        self._robot = RobotView(params['robot_mask'])
+        self._node, self._robot = node, RobotView(params['robot_mask'])
+        self._cameras = [topic for name, (_, topic) in camera_topics(params).items()
+                         if name != 'objects']
         self._newest = {}
         for name, types, qos in (('start', camera_topics(params), STREAM),
                                  ('goal', goal_topics(params['robot_mask']), LATCHED)):
@@ -151,6 +154,10 @@ class RequestReader:
         :raises ImageError: for a start picture without the mask that it needs.
         """
         newest = self._newest[name]
+        if name == 'start':
+            cameras = rivals(self._node, self._cameras)
+            if cameras:
+                raise ImageError(f'start: {cameras}; leave one of them, or send a picture along')
         found = newest.newest('image')
         if found is None:
             raise ImageError(

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
-from tap_ros.errors import ConfigError, KinematicsError, TapError
+from tap_ros.errors import ConfigError, ImageError, KinematicsError, TapError
 from tap_ros.messages.images import decode_camera_info
 from tap_ros.messages.joints import JointHistory
 from tap_ros.messages.stamps import to_nanoseconds
@@ -20,7 +20,13 @@ from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import declared_mount, Parameters
 from tap_ros.nodes.ros_messages import encode_mask
-from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription, steady_timer
+from tap_ros.nodes.services import log_error
+from tap_ros.nodes.subscriptions import (
+    adapt_regularly,
+    AdaptiveSubscription,
+    rivals,
+    steady_timer,
+)
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
@@ -121,6 +127,9 @@ class RobotMaskNode(Node):
                 if isinstance(error, KinematicsError) and waited <= self.params['max_silence']:
                     continue  # joints may come
                 self._tell(error)
+            except Exception as error:  # it costs this picture
+                self._diagnostics.error(error)
+                log_error(self, 'robot mask', error)
             self._waiting.remove(picture)
 
     def _mask(self, info: CameraInfo) -> np.ndarray:
@@ -131,6 +140,9 @@ class RobotMaskNode(Node):
         :raises ImageError: for a camera that cannot be used.
         """
         begin, robot = time.perf_counter(), self._robot
+        cameras = rivals(self, ['camera/camera_info'])
+        if cameras:
+            raise ImageError(f'{cameras}; leave one of them')
         if robot is None:
             raise KinematicsError('nothing that can be used has come on robot_description; name a '
                                   'file by the parameter urdf')

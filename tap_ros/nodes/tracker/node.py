@@ -20,11 +20,11 @@ from tap_ros.contract import WORLD_FRAME
 from tap_ros.errors import ImageError, KinematicsError, TapError, TrackingError
 from tap_ros.messages.images import decode_camera_info, decode_image, decode_mask, is_empty
 from tap_ros.messages.joints import GripperHistory
-from tap_ros.messages.objects import decode_objects
+from tap_ros.messages.objects import decode_objects, MAX_OBJECTS
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE, JOINT_STATES
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.observations import Moment, Observations, reception_time
+from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
 from tap_ros.nodes.parameters import declared_arm, Parameters, pose_matrix
 from tap_ros.nodes.ros_messages import encode_objects
 from tap_ros.nodes.services import answering, log_error
@@ -38,10 +38,12 @@ from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, SERVICE_QO
 from tap_ros.plugins import load_plugin, names
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.text import escaped, listing
-from tap_ros.tracking.plane import MIDDLE, Plane
+from tap_ros.tracking.plane import check_pose, MIDDLE, Plane
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, Tracker, View
 from tap_ros.tracking.registration import propose
 from tap_ros.training.robot_mask import hidden_pixels
+
+MOVED = 2.0  # px of the working picture by which the table has moved in that of another camera
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,11 @@ class Selection:
     size: tuple[int, int]  # (height, width) of its pictures
     selected_ns: int  # stamp of the picture in which they were clicked
     jumps: int  # of the clock of the stamps until then
-    publishers: Mapping[str, Mapping[bytes, str]]  # of each topic then
+    publishers: Mapping[str, Mapping[bytes, set[str]]]  # of each topic then
     stamp_ns: int  # of the newest picture in which they were followed
     received: float  # s, monotonic: when that picture was received
     tracked: Tracked
-    message: ObjectStates
+    message: ObjectStates | None  # of that picture; None: they could not be followed in it
     goal_ns: int | None = None  # stamp of the goal picture in which they were searched
 
 
@@ -75,6 +77,8 @@ class TrackerNode(Node):
         self.params = declare_parameters(self)
         self._make = load_plugin('tap_ros.trackers', self.params['tracker'])
         self._mounted = self.params.camera_pose() if self.params['camera_z'] else None
+        if self._mounted is not None:
+            check_pose(self._mounted)
         self._lock = threading.RLock()  # of what follows
         self._selection: Selection | None = None
         self._info: CameraInfo | None = None
@@ -140,7 +144,10 @@ class TrackerNode(Node):
         if message.event != Episode.START:
             return
         # Known at once to who holds the lock, and searches a picture.
-        self._begun = to_nanoseconds(message.header.stamp), self._sensors.jumps
+        begun_ns, newest = to_nanoseconds(message.header.stamp), self._sensors.newest('image')
+        if newest is not None and begun_ns > newest.stamp_ns + JUMP_NS:
+            begun_ns = newest.stamp_ns + 1  # of another clock: it begins with the next picture
+        self._begun = begun_ns, self._sensors.jumps
         with self._lock:
             if self._selection is not None and self._ended(self._selection):
                 self._forget('a new episode has begun')
@@ -173,10 +180,13 @@ class TrackerNode(Node):
         :raises TapError: for names or clicks that cannot be used; then nothing changes.
         """
         found, clicks = self._asked(request, view.image.shape[:2])
-        rivals = self.count_publishers('objects') - 1
-        if rivals > 0:
+        cameras = rivals(self, self._own_topics)
+        if cameras:
+            raise TrackingError(f'{cameras}; leave one of them')
+        others = self.count_publishers('objects') - 1
+        if others > 0:
             raise TrackingError(
-                f'{rivals} other nodes publish on {self.resolve_topic_name("objects")}; end '
+                f'{others} other nodes publish on {self.resolve_topic_name("objects")}; end '
                 'them, or start the simulator with objects:=tracked')
         tracker: Tracker = self._make(camera)
         tracked = tracker.select(view, clicks)
@@ -201,19 +211,23 @@ class TrackerNode(Node):
             raise TrackingError(
                 f'nothing has come on {self._goals.names(["image"], explained=True)}; without a '
                 'goal picture nothing can be proposed')
-        pixels = propose(view, self._goal_view(goal, view.image.shape[:2]))
-        if not len(pixels):
-            raise TrackingError('the goal picture shows nothing elsewhere; click on each object')
         tracker: Tracker = self._make(camera)
-        return tracker.select(view, pixels)  # for the outlines
+        found = []
+        for pixel in propose(view, self._goal_view(goal, view.image.shape[:2])):
+            with suppress(TrackingError):  # it could not be followed
+                tracker.select(view, [pixel])
+                found.append(pixel)
+        if not found:
+            raise TrackingError('the goal picture shows nothing elsewhere; click on each object')
+        return tracker.select(view, found)  # for the outlines
 
     def _asked(self, request: SelectObjects.Request,
                size: tuple[int, int]) -> tuple[tuple[str, ...], np.ndarray]:
         """Return names and clicks (K, 2) of a request; TapError for those that are of no use."""
-        if not request.names or not len(request.names) == len(request.u) == len(request.v):
+        if not 1 <= len(request.names) == len(request.u) == len(request.v) <= MAX_OBJECTS:
             raise TrackingError(
                 f'names, u and v have {len(request.names)}, {len(request.u)} and '
-                f'{len(request.v)} entries; expected as many of each, at least one')
+                f'{len(request.v)} entries; expected as many of each, 1 to {MAX_OBJECTS}')
         clicks = np.column_stack([request.u, request.v])
         asked = encode_objects(request.names, clicks, None, 0, '', ObjectStates.SOURCE_TRACKED)
         return decode_objects(asked, 'select_objects', size)
@@ -223,23 +237,26 @@ class TrackerNode(Node):
     def _newest(self) -> tuple[Moment, View]:
         """Return the newest picture; TrackingError where there is none of this scene."""
         moment = self._sensors.newest(*self._topics)
-        begun_ns, jumps = self._begun
         if moment is None:
             missing = self._sensors.missing(self._topics)
             raise TrackingError(
                 f'nothing has come on {self._sensors.names(missing, explained=True)}' if missing
                 else f'no messages of the same stamp on {self._sensors.names(self._topics)}')
-        if moment.stamp_ns < begun_ns and jumps == self._sensors.jumps:
+        if moment.stamp_ns < self._scene_ns():
             raise TrackingError('no picture of the new episode has come yet; click again')
         return moment, self._view(moment)
 
     def _view(self, moment: Moment) -> View:
         """Return what a picture shows, with the gripper where it is known by now."""
         picture = decode_image(moment.messages['image'], 'camera/image_raw')
-        gripper = None
+        return View(picture, self._mask(moment, 'camera/robot_mask', picture),
+                    self._hand(moment.stamp_ns))
+
+    def _hand(self, stamp_ns: int) -> np.ndarray | None:
+        """Return the gripper's state (4,) at the time of a picture, None if it is not known."""
         with suppress(KinematicsError):
-            gripper, _ = self._gripper.at(moment.stamp_ns, self.params['max_silence'])
-        return View(picture, self._mask(moment, 'camera/robot_mask', picture), gripper)
+            return self._gripper.at(stamp_ns, self.params['max_silence'])[0]
+        return None
 
     def _goal_view(self, goal: Moment, size: tuple[int, int]) -> View:
         """Return what a goal picture shows; ImageError for one of another size."""
@@ -259,13 +276,18 @@ class TrackerNode(Node):
 
         The pose is that of the parameters, else of camera/pose, as the simulator tells it.
 
-        :raises ImageError: for a camera_info that is missing, or not that of these pictures.
+        :raises TapError: for a pose of no use, and for a camera_info that is missing, or not that
+            of these pictures.
         """
         pose = self._mounted
         if pose is None and self._told is not None:
             told = self._told.pose
-            pose = pose_matrix([getattr(told.position, axis) for axis in 'xyz'],
-                               [getattr(told.orientation, axis) for axis in 'xyzw'])
+            try:
+                pose = pose_matrix([getattr(told.position, axis) for axis in 'xyz'],
+                                   [getattr(told.orientation, axis) for axis in 'xyzw'])
+                check_pose(pose)
+            except TapError as error:
+                raise TrackingError(f'{CAMERA_POSE.name}: {error}') from error
         if pose is None:
             return None, None
         if self._info is None:
@@ -307,14 +329,21 @@ class TrackerNode(Node):
         if moment is None or moment.stamp_ns < selection.stamp_ns:
             return
         if moment.stamp_ns == selection.stamp_ns:
-            if moment.received > selection.received:  # sent again
-                self._objects.publish(selection.message)
+            if moment.received > selection.received and selection.message is not None:
+                self._objects.publish(selection.message)  # it was sent again
                 self._selection = replace(selection, received=moment.received)
             return
-        view = self._view(moment)
-        if (view.gripper is None and self._gripper.received > -math.inf
+        if (self._gripper.received > -math.inf and self._hand(moment.stamp_ns) is None
                 and time.monotonic() - moment.received < self.params['patience']):
             return  # its joints may come
+        # Whatever fails costs this picture, which is not tried again.
+        self._selection = replace(
+            selection, stamp_ns=moment.stamp_ns, received=moment.received, message=None)
+        view = self._view(moment)
+        changed = self._other_camera(selection, view.image.shape[:2])
+        if changed:
+            self._forget(changed)
+            return
         begin = time.perf_counter()
         tracked = selection.tracker.update(view)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'track')
@@ -322,9 +351,7 @@ class TrackerNode(Node):
             selection.names, tracked, selection.plane, moment.messages['image'].header)
         self._objects.publish(message)
         self._tell(selection, tracked)
-        self._selection = replace(
-            selection, stamp_ns=moment.stamp_ns, received=moment.received, tracked=tracked,
-            message=message)
+        self._selection = replace(self._selection, tracked=tracked, message=message)
 
     def _look_at_goal(self, selection: Selection) -> None:
         """Find the objects in the goal picture, if that is another one."""
@@ -342,7 +369,7 @@ class TrackerNode(Node):
         begin = time.perf_counter()
         try:
             found = selection.tracker.find(self._goal_view(goal, selection.size))
-        except TapError:
+        except Exception:
             self._goal_objects.publish(ObjectStates(header=header))  # not those of another goal
             raise
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'find')
@@ -360,16 +387,32 @@ class TrackerNode(Node):
             self.get_logger().warning(f'goal/image: {missing} not found: place it, in the '
                                       'explorer or by goal_objects of reach_goal')
 
+    def _scene_ns(self) -> int:
+        """Return when the scene of the newest picture began, 0 if no mark of its clock says."""
+        (begun_ns, jumps), newest = self._begun, self._sensors.newest('image')
+        known = newest is not None and begun_ns <= newest.stamp_ns + JUMP_NS
+        return begun_ns if known and jumps == self._sensors.jumps else 0
+
     def _ended(self, selection: Selection) -> bool:
         """Return whether another episode has begun since a selection."""
-        begun_ns, jumps = self._begun
-        return begun_ns > selection.selected_ns and jumps == selection.jumps
+        return self._scene_ns() > selection.selected_ns and self._sensors.jumps == selection.jumps
 
     def _other_scene(self, selection: Selection) -> str:
         """Say in what way the camera shows another scene than that of a selection, '' if not."""
         if self._sensors.jumps != selection.jumps:
             return 'the clock of its pictures has jumped: another camera, simulator or recording'
         return rivals(self, self._own_topics, selection.publishers)
+
+    def _other_camera(self, selection: Selection, size: tuple[int, int]) -> str:
+        """Say how pictures of a size differ from those of a selection, '' if they do not."""
+        if size != selection.size:
+            return 'pictures have {1}x{0} pixels now, and had {3}x{2}'.format(
+                *size, *selection.size)
+        if selection.plane is not None:
+            plane, _ = self._calibration(size)
+            if plane is None or plane.apart(selection.plane) > MOVED:
+                return f'{CAMERA_INFO.name} or {CAMERA_POSE.name} has changed'
+        return ''
 
     def _forget(self, why: str) -> None:
         """Follow nothing any more."""
@@ -390,19 +433,26 @@ class TrackerNode(Node):
         """Log which objects are known less well than before, and which well again."""
         usual = (SEEN, HIDDEN)
         for name, before, now in zip(selection.names, selection.tracked.states, tracked.states):
-            if now != before and not {before, now} <= {*usual}:
-                log = self.get_logger().info if now in usual else self.get_logger().warning
-                log(f'{escaped(name)} is {now}')
+            if now == before or {before, now} <= {*usual}:
+                continue
+            # On two lines: ROS refuses one that logs in two severities.
+            if now in usual:
+                self.get_logger().info(f'{escaped(name)} is {now}')
+            else:
+                self.get_logger().warning(f'{escaped(name)} is {now}')
 
     def _encode(self, found: Sequence[str], tracked: Tracked, plane: Plane | None,
                 header: Any) -> ObjectStates:
-        """Return the message about objects in a picture of this header."""
+        """Return the message about objects in a picture of this header; TapError for NaN."""
+        if not np.isfinite(tracked.pixels).all():
+            raise TrackingError(f'parameter tracker: {self.params["tracker"]} places '
+                                f'{listing(found)} at pixels that are no numbers')
         poses = None
         if plane is not None:
             poses = np.full((len(found), 7), np.nan)
             poses[:, :2] = plane.of_middle(plane.shrink(tracked.pixels))
             poses[:, 2] = MIDDLE
-            poses[np.array(tracked.states) == LOST] = np.nan
+            poses[(np.array(tracked.states) == LOST) | ~np.isfinite(poses[:, :3]).all(1)] = np.nan
         return encode_objects(
             found, tracked.pixels, poses, header.stamp,
             header.frame_id if plane is None else WORLD_FRAME, ObjectStates.SOURCE_TRACKED,
