@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image as Picture
 import pytest
 from tap_ros.errors import RecordingError
-from tap_ros.images.crop import Crop
+from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.recording.bags import list_topics, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import encode
@@ -179,6 +179,11 @@ def test_other_recordings_are_read_as_those_of_the_training(tmp_path):
     assert reading_like(training, [tmp_path / 'b'], '/front') == replace(
         expected, image_topic='/front')
     assert reading_like({}, [tmp_path / 'b']) == Reading()
+    # As nodes do: pictures that are cut already stay, larger ones of the same camera are scaled.
+    for side, crop, cut in ((16, Crop('8,0,96', 16), Crop()), (64, Crop(), Crop(size=16))):
+        bag = record(tmp_path / str(side), [camera(1, np.zeros((side, side, 3), np.uint8))])
+        found = reading_like({}, [bag], trained=TrainedCrop(crop, (96, 128), (16, 16)))
+        assert found.cut == cut
 
 
 def test_unmarked_recordings_are_cut_by_pauses_or_by_length(tmp_path):
