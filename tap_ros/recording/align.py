@@ -21,7 +21,7 @@ from tap_ros.recording.damage import FAR, seconds
 from tap_ros.recording.episode import EpisodeTable, RecordingWarning
 from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
-from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, Span
+from tap_ros.recording.spans import assign, find_rounds, in_gaps, MAX_JITTER_NS, read_spans, Span
 from tap_ros.robots.arm import get_arm
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
@@ -56,9 +56,12 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     tracks, names, marks = join(parts)
     gaps = _gaps(parts)
     tracks['twist'] = _without_stops(tracks['twist'])
+    shown = tracks['frame']
+    rounds = () if marks else shown.order[find_rounds(shown.stamp, shown.picked()[:, 0])]
     tracks = put_right(tracks, parts[0].source, parts[0].topics, gaps)
     frame = tracks['frame']
-    spans = read_spans(frame, tracks['mark'], marks, gaps, reading, parts[0].source)
+    spans = read_spans(frame, tracks['mark'], marks, gaps, reading, parts[0].source,
+                       np.flatnonzero(np.isin(frame.order, rounds)))
     owner = _owner(spans, frame, gaps, parts)
     order = np.lexsort((frame.stamp, owner))
     frame, owner = frame.take(order[owner[order] >= 0]), owner[order[owner[order] >= 0]]

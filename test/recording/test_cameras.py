@@ -7,7 +7,7 @@ import io
 import re
 
 import cv2
-from made_bags import camera, IMAGE, message, read, record, SECOND, write_mcap
+from made_bags import camera, IMAGE, message, read, record, SECOND, shown, write_mcap
 from made_episodes import make_episode
 import numpy as np
 from PIL import Image as Picture
@@ -26,9 +26,9 @@ TOPIC = '/camera/color/image_raw/compressed'
 
 
 def scene(t, size=(48, 64)):
-    """Return a smooth picture with a dot that moves."""
+    """Return a smooth picture with a dot that moves; none of the next 99 is the same."""
     y, x = np.mgrid[:size[0], :size[1]]
-    picture = np.stack([x * 255 // size[1], y * 255 // size[0], np.full_like(x, 90)], -1)
+    picture = np.stack([x * 255 // size[1], y * 255 // size[0], np.full_like(x, 90 + t % 99)], -1)
     return cv2.circle(picture.astype(np.uint8), (20 + t % 20, 24), 4, (250, 40, 20), -1)
 
 
@@ -246,3 +246,19 @@ def test_of_several_bags_each_is_an_episode(tmp_path):
         record(tmp_path / 'bags' / name, map(camera, range(1, 51)))
     assert [len(e) for e in read(tmp_path / 'bags')[0]] == [50, 50]
     assert len(open_recordings(tmp_path / 'bags' / 'a')) == 3
+
+
+@pytest.mark.parametrize('restamped', [False, True])
+def test_each_round_of_a_recorded_loop_is_an_episode(tmp_path, restamped):
+    messages = [camera(logged if restamped else 1 + i / 10, value=5 * i, log=logged)
+                for n in range(3) for i in range(20) if (n, i) not in ((1, 0), (1, 7), (2, 12))
+                for logged in [9 + 2.5 * n + i / 10]]
+    found, told = read(record(tmp_path / 'bag', messages))
+    assert [one[0] for one in shown(found)] == [0, 5, 0] and sum(map(len, found)) == 57
+    assert all(sorted(one) == one for one in shown(found))
+    assert any('its pictures begin anew, 2 times' in text for text in told)
+    # A scene that looks now and then as before, to the bit, is none.
+    values = [*range(30), *range(30, 10, -1), 3, 3, *range(50, 70), 3, 0]
+    found, told = read(record(tmp_path / 'other', [
+        camera(1 + i / 10, value=value) for i, value in enumerate(values)]))
+    assert shown(found) == [values] and not told
