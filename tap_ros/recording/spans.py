@@ -62,11 +62,11 @@ def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.nd
     :param source: what warnings call the recording.
     :param rounds: rows of frames that begin a round, see find_rounds.
     """
-    if len(rounds):
+    pauses = frame.stamp[rounds] - frame.stamp[rounds - 1]
+    if count := int((pauses <= (reading.gap or np.inf) * 1e9).sum()):
         warnings.warn(
-            f'{source}: its pictures begin anew, {len(rounds)} times, as where a playback in a '
-            'loop was recorded; each round is an episode of its own', RecordingWarning,
-            stacklevel=4)
+            f'{source}: its pictures begin anew, {count} times, as where a playback in a loop was '
+            'recorded; each round is an episode of its own', RecordingWarning, stacklevel=4)
     if not marks and reading.gap:
         _propose_gap(frame.stamp, reading, source)
     places = gaps[np.argsort(gaps[:, 0], kind='stable')].tolist()
