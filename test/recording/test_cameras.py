@@ -262,3 +262,43 @@ def test_each_round_of_a_recorded_loop_is_an_episode(tmp_path, restamped):
     found, told = read(record(tmp_path / 'other', [
         camera(1 + i / 10, value=value) for i, value in enumerate(values)]))
     assert shown(found) == [values] and not told
+
+
+def views(n, cameras, every=1):
+    """Return (seconds, number of the camera, picture) of cameras that look at one scene."""
+    rng = np.random.default_rng(3)
+    walls = [rng.integers(60, 200, (6, 8, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+             for _ in range(cameras)]
+    return [(1 + t / 10 + 0.007 * k, k, cv2.circle(
+        walls[k].copy(), (5 + t, 24), 4, (250, 40, 20), -1)) for t in range(n)
+        for k in range(cameras) if not k or (t > 5 and t % every == 0)]
+
+
+@pytest.mark.parametrize(('cameras', 'every', 'form'), [
+    (2, 1, ''), (3, 1, ''), (2, 3, ''), (2, 1, 'JPEG')])
+def test_several_cameras_on_one_topic_are_told_of(tmp_path, cameras, every, form):
+    shot = views(40, cameras, every)
+    for named in (True, False):
+        stamp = [{'header': {'stamp': {'sec': int(t), 'nanosec': round(t % 1 * SECOND)},
+                             'frame_id': f'eye_{k}' if named else 'eye'}} for t, k, _ in shot]
+        bag = record(tmp_path / str(named), [
+            camera(t, picture, **header) if not form else (TOPIC, COMPRESSED, encode(
+                COMPRESSED, {**header, 'format': 'jpeg', 'data': packed(picture)}), round(
+                    t * SECOND)) for (t, _, picture), header in zip(shot, stamp)])
+        if named:
+            with pytest.raises(RecordingError, match='frame_id eye_0 .64x48., frame_id eye_1'):
+                read(bag)
+        else:
+            assert any('two views alternate, as where several' in text for text in read(bag)[1])
+
+
+@pytest.mark.parametrize('spoil', [
+    lambda i, picture: picture, lambda i, picture: (picture * (0.4 + 0.6 * (i % 2))),
+    lambda i, picture: picture * np.linspace(1, 0.2 + 0.8 * (i % 2), 64)[:, None],
+    lambda i, picture: picture * (i % 4 > 0), lambda i, picture: np.roll(picture, 5 * i, 1),
+    lambda i, picture: picture + np.random.default_rng(i).normal(0, 20, picture.shape)])
+def test_light_that_flickers_noise_and_black_pictures_are_no_second_camera(tmp_path, spoil):
+    _, told = read(record(tmp_path / 'bag', [
+        camera(t, np.clip(spoil(i, picture), 0, 255).astype(np.uint8))
+        for i, (t, _, picture) in enumerate(views(60, 1))]))
+    assert not told
