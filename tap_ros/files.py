@@ -101,6 +101,27 @@ def only_writer(folder: str | Path) -> Iterator[None]:
         os.close(handle)
 
 
+@contextmanager
+def only_keeper(path: str | Path) -> Iterator[None]:
+    """
+    Be the only process that keeps a file, as long as the context lasts.
+
+    :param path: of the file; a lock file is made beside it, and stays.
+    :raises StorageError: when another process keeps it, or its folder cannot be written to.
+    """
+    path = Path(path).resolve()
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path.with_name(f'.{path.name}.lock'), os.O_RDONLY | os.O_CREAT, 0o666)
+    try:
+        if not _lock(handle, wait=False):
+            raise StorageError(f'{escaped(path)}: another process keeps it; end that one, or '
+                               'choose another file')
+        yield
+    finally:
+        os.close(handle)
+
+
 def free_folder(wanted: str | Path) -> Path:
     """Return this folder, or the first one with a number added that does not exist."""
     folder, number = Path(wanted), 1

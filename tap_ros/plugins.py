@@ -15,6 +15,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from tap_ros.errors import ConfigError
+from tap_ros.text import escaped
 
 # By group: name -> 'module:attribute'.
 BUILT_IN: dict[str, dict[str, str]] = {
@@ -40,6 +41,10 @@ BUILT_IN: dict[str, dict[str, str]] = {
                        'ogbench': 'sim_bridge.ogbench:OGBench'},
 }
 
+_HAS = {  # an attribute of what entry points of a group name; of others that they can be called
+    'tap_ros.arms': 'joints', 'tap_ros.forward_models': 'load', 'tap_ros.predictors': 'load',
+    'tap_ros.tasks': 'demonstrate'}
+
 
 def names(group: str) -> list[str]:
     """Return the names of a group, sorted: those of this package and those of entry points."""
@@ -53,16 +58,28 @@ def load_plugin(group: str, name: str) -> Any:
     :param group: one of BUILT_IN, such as 'tap_ros.arms'.
     :param name: of this package, or of an entry point of the group; this package's go first.
     :return: the class or object.
-    :raises ConfigError: for an unknown name; it names the nearest one and all valid ones.
+    :raises ConfigError: for an unknown name; it names the nearest one and all valid ones. Likewise
+        for an entry point that cannot be imported, or is no such thing; it names its package.
     """
+    kind = group.partition('.')[2].removesuffix('s').replace('_', ' ')
     place = BUILT_IN[group].get(name)
     if place is not None:
         module, _, attribute = place.partition(':')
         return getattr(import_module(module), attribute)
     for point in entry_points(group=group, name=name):
-        return point.load()
+        try:
+            found = point.load()
+            if not hasattr(found, _HAS.get(group, '__call__')):
+                raise TypeError(f'is of type {type(found).__name__}, which is no {kind}')
+        except (Exception, SystemExit) as error:
+            package = point.dist.name if point.dist else 'an unknown package'
+            why = escaped(f'{type(error).__name__}: {error}', 300)
+            raise ConfigError(
+                f'{kind} {escaped(name, 60)}: entry point {escaped(point.value, 100)} of the '
+                f'package {escaped(package, 60)} cannot be used: {why}; mend that package, or '
+                f'uninstall it') from error
+        return found
     valid = names(group)
     near = get_close_matches(name, valid, 1)
     meant = f'did you mean {near[0]!r}? ' if near else ''
-    kind = group.partition('.')[2].removesuffix('s').replace('_', ' ')
     raise ConfigError(f'{kind} {name!r} is unknown; {meant}valid: {", ".join(valid) or "none"}')

@@ -49,8 +49,8 @@ def run(args: Forward) -> None:
     _, _, training = load_weights(args.weights, 'forward_model')
     rows = []
     for recording in args.recordings:
-        store = open_recordings(
-            [recording], reading=reading_like(training, [recording], args.image_topic))
+        store = open_recordings([recording], reading=reading_like(
+            training, [recording], args.image_topic, model.camera_crop))
         if store.image_size != (model.config.image_size,) * 2:
             raise ConfigError(f'{args.weights}: made for {model.config.image_size} pixels a side, '
                               f'{recording} has {store.image_size}; use matching ones')

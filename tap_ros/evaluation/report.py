@@ -16,6 +16,7 @@ from tap_ros.evaluation.prediction import EpisodeScores, evaluate, verdict
 from tap_ros.evaluation.samples import SampleScores, score_samples
 from tap_ros.evaluation.strips import write_strips
 from tap_ros.files import write_atomically
+from tap_ros.images.crop import trained_crop
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
@@ -44,11 +45,12 @@ def run(args: Prediction) -> None:
     if predictor_files(args.weights):
         network, training = load_network(args.weights)
         size = network.config.image_size
+        trained = trained_crop(training, (size, size))
     else:
         network, training = load_predictor(args.weights), {}
-        size = network.image_size[0]
-    store = open_recordings(
-        args.recordings, reading=reading_like(training, args.recordings, args.image_topic))
+        size, trained = network.image_size[0], network.camera_crop
+    store = open_recordings(args.recordings, reading=reading_like(
+        training, args.recordings, args.image_topic, trained))
     if store.image_size != (size, size):
         raise ConfigError(f'{args.weights}: made for {size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')

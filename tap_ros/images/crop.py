@@ -191,6 +191,15 @@ class TrainedCrop:
             raise ImageError(f'{name}: {error}') from error
         return self.crop if cut == self.size else Crop(self.crop.part, self.size[0])
 
+    def unlike(self, size: Sequence[int], name: str) -> str:
+        """Say that a picture's middle shows more or less than in training; '': it does not."""
+        if (self.crop.part != CENTRE or self.camera_size is None or tuple(size) == self.size
+                or size[0] * self.camera_size[1] == size[1] * self.camera_size[0]):
+            return ''
+        return ('{0}: the weights were trained on the middle of pictures of {4}x{3} (width x '
+                'height); that of {2}x{1} may show another part of the scene'.format(
+                    name, *size, *self.camera_size))
+
 
 def trained_crop(training: Mapping[str, Any], size: tuple[int, int]) -> TrainedCrop:
     """

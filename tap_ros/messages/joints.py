@@ -25,6 +25,9 @@ PLACE, OPENING = GRIPPER_JOINTS[:3], GRIPPER_JOINTS[3]
 KEPT_NS = 5 * 10**9  # what is older than the newest state by more is forgotten
 MOST = 10_000  # states kept of a joint
 FARTHEST = 100.0  # rad or m; no joint is there
+_FASTEST, _AT_ZERO = 10.0, 1.0  # rad/s or m/s: there and back; likewise where it is 0 to the bit
+_JUMP = 0.05  # rad or m: less is no jump
+_BRIEF = 1.0  # s; who is elsewhere for longer is there
 
 
 def decode_positions(message: Any) -> dict[str, float]:
@@ -81,6 +84,43 @@ def positions_at(times: np.ndarray, values: np.ndarray, at: np.ndarray, hold: in
     nearest = np.where(newer < older, values[after], values[before])
     held = np.where(np.minimum(older, newer) <= hold, nearest, np.nan)
     return np.where(np.maximum(older, newer) <= MAX_GAP * 1e9, found, held)
+
+
+def contradicted(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """
+    Tell which recorded positions of a joint contradict those before and after them.
+
+    Where several nodes publish joint states, or a driver sends zeros until it knows, a joint seems
+    to jump and to be back in no time. Zeros are the ones that are wrong; else those that are not
+    by far the most.
+
+    :param times: (N,) int64 ns, increasing.
+    :param values: (N,) float64, finite.
+    :return: (N,) bool.
+    """
+    wrong = np.zeros(len(values), bool)
+    for zeros in (True, False):
+        rows = np.flatnonzero(~wrong)
+        t, x = times[rows] / 1e9, values[rows]
+        steps, pace = np.abs(np.diff(x)), np.diff(t)
+        slow = zeros & ((x[1:] == 0) | (x[:-1] == 0))
+        edges = np.flatnonzero(steps > _JUMP + np.where(slow, _AT_ZERO, _FASTEST) * pace) + 1
+        if not len(edges):
+            continue
+        begins, ends = np.append(0, edges), np.append(edges, len(x))  # of the parts between jumps
+        before, after = np.maximum(begins - 1, 0), np.minimum(ends, len(x) - 1)
+        least = np.minimum(np.abs(x[begins] - x[before]), np.abs(x[ends - 1] - x[after]))
+        brief = (t[after] - t[before] < _BRIEF) & (np.abs(x[after] - x[before]) <= least / 2)
+        counts = ends - begins
+        if zeros:
+            # What is before the first jump, or behind the last, is not back: it has to be large.
+            brief[[0, -1]] = (steps > _JUMP + _FASTEST * pace)[edges[[0, -1]] - 1]
+            brief &= (x[begins] == 0) & (x[ends - 1] == 0)
+        else:
+            brief[[0, -1]] = False
+            brief[1:-1] &= counts[1:-1] <= 4 * np.maximum(counts[:-2], counts[2:])
+        wrong[rows[np.repeat(brief, counts)]] = True
+    return wrong
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,20 @@ The server is for this machine alone, and a page of another site cannot write th
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 import json
 from pathlib import Path
+import socket
 import threading
+import time
 from typing import Annotated, Any
 
-from tap_ros.errors import ConfigError, TapError
+from tap_ros.errors import ConfigError, StorageError, TapError
+from tap_ros.files import only_keeper
 from tap_ros.images.drawing import png_bytes
 from tap_ros.options import File
 from tap_ros.prediction.preference import LEAST_FRAMES
@@ -27,7 +31,9 @@ from tap_ros.text import escaped
 from tyro import conf
 
 _HOST = '127.0.0.1'
-_LARGEST = 2 ** 16  # bytes of a request
+MAX_BODY = 2 ** 16  # bytes
+MAX_CONNECTIONS = 64
+LONGEST_S = 20.0  # of a connection
 _PAGE = {'/': ('mark.html', 'text/html'), '/mark.js': ('mark.js', 'text/javascript')}
 _POLICY = ("default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; "
            "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -77,16 +83,18 @@ class Marking:
         Replace the marks of an episode, and write the file; without frames it has none.
 
         :raises ConfigError: for an episode that there is not, and frames not between its ends.
+        :raises StorageError: when the file cannot be written; the marks are then what they were.
         """
-        known = isinstance(episode, int) and episode in self._usable
+        known = isinstance(episode, int) and episode in self._usable and isinstance(frames, list)
         if not known or not all(isinstance(t, int) and 0 < t < self.store.lengths[episode] - 1
                                 for t in frames):
             raise ConfigError('expected an episode and frames between its start and its goal')
         with self._lock:
-            self._marks[episode] = [(t, t) for t in sorted(set(frames))]
-            if not frames:
-                del self._marks[episode]
-            write_marks(self.path, self.store, self._recordings, self._marks)
+            marks = {i: those for i, those in self._marks.items() if i != episode}
+            if frames:
+                marks[episode] = [(t, t) for t in sorted(set(frames))]
+            write_marks(self.path, self.store, self._recordings, marks)
+            self._marks = marks
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows."""
@@ -105,18 +113,40 @@ class Marking:
 
 class Server(ThreadingHTTPServer):
     """
-    Serves the page; its server_port says where.
+    Serves the page; its server_port says where. Connections are few and end in time.
 
     :raises ConfigError: for a port that cannot be used.
     """
 
     def __init__(self, marking: Marking, port: int = 0) -> None:
         self.marking = marking
+        self._ends: dict[socket.socket, float] = {}  # s, monotonic, of the open connections
         try:
             super().__init__((_HOST, port), Handler)
         except (OSError, OverflowError) as error:
             raise ConfigError(f'port {port}: cannot be listened at ({error}); choose another, or '
                               '0 for any that is free') from error
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        """Take no more connections than browsers make."""
+        return len(self._ends) < MAX_CONNECTIONS
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread."""
+        self._ends[request] = time.monotonic() + LONGEST_S
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Forget a connection."""
+        self._ends.pop(request, None)
+        super().shutdown_request(request)
+
+    def service_actions(self) -> None:
+        """End connections that take too long, from time to time."""
+        for request, end in list(self._ends.items()):
+            if time.monotonic() > end:
+                with suppress(OSError):
+                    request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, *_: object) -> None:
         """Say nothing of browsers that go away."""
@@ -137,7 +167,8 @@ class Handler(BaseHTTPRequestHandler):
             self._send(files('tap_ros.prediction').joinpath('page', name).read_bytes(), kind)
         elif path == 'state':
             self._send_state()
-        elif path == 'frame' and len(numbers) == 2 and all(map(str.isdecimal, numbers)):
+        elif path == 'frame' and len(numbers) == 2 and all(
+                number.isdecimal() and len(number) < 10 for number in numbers):
             self._send_frame(*map(int, numbers))
         else:
             self._refuse(HTTPStatus.NOT_FOUND, 'There is nothing here.')
@@ -149,9 +180,15 @@ class Handler(BaseHTTPRequestHandler):
             return
         try:
             size = int(self.headers.get('Content-Length', 0))
-            asked = json.loads(self.rfile.read(min(size, _LARGEST)))
+            if not 0 <= size <= MAX_BODY:
+                self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                             f'Expected at most {MAX_BODY} bytes.')
+                return
+            asked = json.loads(self.rfile.read(size))
             self.server.marking.mark(asked['episode'], asked['frames'])
-        except (LookupError, TypeError, ValueError, TapError) as error:
+        except StorageError as error:
+            self._refuse(HTTPStatus.INSUFFICIENT_STORAGE, str(error))
+        except (LookupError, TypeError, ValueError, RecursionError, TapError) as error:
             self._refuse(HTTPStatus.BAD_REQUEST, str(error))
         else:
             self._send_state()
@@ -197,8 +234,8 @@ def run(args: Options) -> None:
     """
     path = Path(args.marks) if args.marks else beside(args.recordings[0])
     store = open_recordings(args.recordings, reading=reading_of(args.reading))
-    server = Server(Marking(store, args.recordings, path), args.port)
-    print(f'open http://{_HOST}:{server.server_port} in a browser; marks go to {escaped(path)}; '
-          'Ctrl-C ends', flush=True)
-    with server:
+    with (only_keeper(path),
+          Server(Marking(store, args.recordings, path), args.port) as server):
+        print(f'open http://{_HOST}:{server.server_port} in a browser; marks go to '
+              f'{escaped(path)}; Ctrl-C ends', flush=True)
         server.serve_forever()

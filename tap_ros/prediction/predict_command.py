@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import io
 from pathlib import Path
+import sys
 from typing import Annotated, TYPE_CHECKING
 
 import numpy as np
@@ -92,6 +93,8 @@ def run(args: Options) -> None:
     scaled, places, windows = {}, {}, {}
     for name, picture in pictures.items():
         cut = Crop(args.crop) if args.crop else predictor.camera_crop.of(picture.shape[:2], name)
+        if not args.crop and (why := predictor.camera_crop.unlike(picture.shape[:2], name)):
+            print(f'warning: {why}', file=sys.stderr)
         windows[name] = Crop(cut.part).window(picture.shape[:2])
         scaled[name], places[name] = fit(picture, windows[name], pixels[name], size, name)
     subgoals = predictor.predict(

@@ -13,7 +13,7 @@ from dataclasses import replace
 import warnings
 
 import numpy as np
-from tap_ros.messages.joints import positions_at
+from tap_ros.messages.joints import contradicted, PLACE, positions_at
 from tap_ros.messages.stamps import MAX_GAP
 from tap_ros.recording.clocks import put_right
 from tap_ros.recording.columns import Columns, join, NAMES, Track
@@ -21,8 +21,8 @@ from tap_ros.recording.damage import FAR, seconds
 from tap_ros.recording.episode import EpisodeTable, RecordingWarning
 from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
-from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, Span
-from tap_ros.robots.arm import get_arm
+from tap_ros.recording.spans import assign, find_rounds, in_gaps, MAX_JITTER_NS, read_spans, Span
+from tap_ros.robots.arm import get_arm, MOST_JOINTS
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
 
@@ -56,9 +56,12 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     tracks, names, marks = join(parts)
     gaps = _gaps(parts)
     tracks['twist'] = _without_stops(tracks['twist'])
+    shown = tracks['frame']
+    rounds = () if marks else shown.order[find_rounds(shown.stamp, shown.picked()[:, 0])]
     tracks = put_right(tracks, parts[0].source, parts[0].topics, gaps)
     frame = tracks['frame']
-    spans = read_spans(frame, tracks['mark'], marks, gaps, reading, parts[0].source)
+    spans = read_spans(frame, tracks['mark'], marks, gaps, reading, parts[0].source,
+                       np.flatnonzero(np.isin(frame.order, rounds)))
     owner = _owner(spans, frame, gaps, parts)
     order = np.lexsort((frame.stamp, owner))
     frame, owner = frame.take(order[owner[order] >= 0]), owner[order[owner[order] >= 0]]
@@ -72,7 +75,8 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
         parts=parts, starts=clock.starts, spans=spans, stamps=frame.stamp, logs=frame.log,
         places={'frame': (frame.file, frame.index), 'mask': _masks(tracks['mask'], clock, parts),
                 **_goals(tracks, spans, gaps)},
-        actions=_actions(tracks, clock), grippers=_grippers(tracks, clock, arm),
+        actions=_actions(tracks, clock),
+        grippers=_grippers(tracks, clock, arm, parts[0].source),
         objects=_by_name(*clock.nearest_rows(tracks['object']), tracks['object'], names,
                          picked[clock.owner]),
         names=[names[i] for i in picked.tolist()],
@@ -118,19 +122,26 @@ class _Clock:
         best = np.where(nearer, after, before)
         return rows[best], np.abs(times[best] - self.times) <= self.match
 
-    def positions(self, track: Track, values: np.ndarray) -> np.ndarray:
+    def positions(self, track: Track, values: np.ndarray,
+                  places: int) -> tuple[np.ndarray, np.ndarray]:
         """
         Return where joints were at each frame, (F, J) float64, NaN where it is unknown.
 
         :param track: N messages.
         :param values: (N, J) float64, NaN for a joint that a message does not tell of.
+        :param places: of so many first joints positions that contradict others are left out.
+        :return: that, and of which messages some are, (N,) bool.
         """
         times, rows = self._around(track)
-        columns = []
-        for column in values[rows].T:
+        columns, wrong = [], np.zeros(len(track), bool)
+        for k, column in enumerate(values[rows].T):
             told = np.isfinite(column)
+            if k < places:
+                left_out = contradicted(times[told], column[told])
+                wrong[rows[told][left_out]] = True
+                told[np.flatnonzero(told)[left_out]] = False
             columns.append(positions_at(times[told], column[told], self.times, self.match))
-        return np.stack(columns, 1)
+        return np.stack(columns, 1), wrong
 
     def _around(self, track: Track) -> tuple[np.ndarray, np.ndarray]:
         """Return the same as rows, also of messages a little before and after the episodes."""
@@ -228,7 +239,8 @@ def _actions(tracks: dict[str, Track], clock: _Clock) -> np.ndarray:
     return actions
 
 
-def _grippers(tracks: dict[str, Track], clock: _Clock, arm: ArmMount) -> np.ndarray:
+def _grippers(tracks: dict[str, Track], clock: _Clock, arm: ArmMount,
+              source: str) -> np.ndarray:
     """
     Return (F, 4) float32: the gripper's state at each frame, NaN where unknown.
 
@@ -237,8 +249,14 @@ def _grippers(tracks: dict[str, Track], clock: _Clock, arm: ArmMount) -> np.ndar
     """
     joint, values = tracks['joint'], tracks['joint'].picked()
     beside = np.isfinite(values[:, :3]).any(1)  # the opening beside the place
-    told = clock.positions(joint, np.where(beside[:, None], values, np.nan))
-    arms = clock.positions(tracks['arm'], tracks['arm'].picked())
+    told, wrong = clock.positions(joint, np.where(beside[:, None], values, np.nan), len(PLACE))
+    arms, others = clock.positions(tracks['arm'], tracks['arm'].picked(), MOST_JOINTS)
+    if count := int(wrong.sum() + others.sum()):
+        warnings.warn(
+            f'{source}: {count} of {len(joint) + len(others)} joint states contradict those near '
+            'them, as where two nodes publish joint states, or a driver sends zeros; they are not '
+            'used, and where nothing else tells it the place of the gripper is unknown',
+            RecordingWarning, stacklevel=4)
     found = np.isnan(told[:, :3]).all(1) & np.isfinite(arms).all(1)
     kind = get_arm(arm.arm)
     told[found, :3] = kind.gripper_at(arms[found, :len(kind.joints)], arm.mount)

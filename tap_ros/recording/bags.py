@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the bags at a path, their files and their topics; say what is wrong with them."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 import itertools
 from pathlib import Path
 from typing import Any
 import warnings
 
 from tap_ros.errors import ConfigError, ImageError, RecordingError
-from tap_ros.images.crop import CENTRE, check_trainable
+from tap_ros.images.crop import CENTRE, check_trainable, TrainedCrop
 from tap_ros.recording.columns import Columns, first_size
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.foreign import open_file, recognise
@@ -69,7 +69,7 @@ def list_topics(path: str | Path) -> list[tuple[str, str, int | None]]:
 
 
 def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
-                 image_topic: str = '') -> Reading:
+                 image_topic: str = '', trained: TrainedCrop | None = None) -> Reading:
     """
     Return how recordings are read as those of a training were.
 
@@ -78,7 +78,10 @@ def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
     :param paths: of the recordings.
     :param image_topic: the camera's topic; by default that of the training where all of them have
         it, else as topic_choice finds it.
+    :param trained: TrainedCrop of the weights; pictures of other cameras are cut as nodes cut
+        them.
     :raises RecordingError: when a recording is missing, or nothing of it can be read.
+    :raises ImageError: for pictures that cannot be cut as in training; it names the recording.
     """
     settings = training.get('settings')
     settings = settings if isinstance(settings, dict) else {}
@@ -86,16 +89,28 @@ def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
         field.name: settings[field.name] for field in fields(Reading)
         if field.name != 'image_topic'
         and isinstance(settings.get(field.name), (str,) if field.type is str else (int, float))}
-    trained = settings.get('image_topic') or ()
-    trained = (trained,) if isinstance(trained, str) else tuple(trained)
+    usual = settings.get('image_topic') or ()
+    usual = (usual,) if isinstance(usual, str) else tuple(usual)
     topics: str | tuple[str, ...] = image_topic
-    if not image_topic and all(set(trained) <= {topic for topic, _, _ in list_topics(path)}
+    if not image_topic and all(set(usual) <= {topic for topic, _, _ in list_topics(path)}
                                for path in paths):
-        topics = trained
+        topics = usual
     try:
-        return Reading(topics, **known)
+        reading = Reading(topics, **known)
     except ConfigError:
-        return Reading(topics)
+        reading = Reading(topics)
+    if trained is None:
+        return reading
+    cuts = set()
+    for bag, size in _first_sizes(paths, reading):
+        cuts.add(trained.of(size, str(bag)))
+        if why := trained.unlike(size, str(bag)):
+            warnings.warn(escaped(why, 500), RecordingWarning, stacklevel=2)
+    if len(cuts) > 1 and reading.crop not in ('', CENTRE):
+        raise RecordingError(f'{list_paths(paths)}: some pictures are cut to {reading.crop} '
+                             'already, others are not; score them apart')
+    cut = cuts.pop() if len(cuts) == 1 else reading.cut
+    return replace(reading, crop=cut.part, size=cut.size)
 
 
 def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: str) -> None:
@@ -110,18 +125,25 @@ def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: 
     :raises RecordingError: when a recording is missing, or lacks the image topic.
     """
     sizes = set()
-    for bag, camera in itertools.product(
-            (bag for path in paths for bag in find_bags(path)), reading.cameras):
-        size = first_size(bag, next(iter(find_topics(bag, camera))))
-        if size is not None:
-            sizes.add(size)
-            with suppress(ImageError):  # whoever opens it is told
-                check_trainable(reading.cut.cut_size(size), network)
+    for _, size in _first_sizes(paths, reading):
+        sizes.add(size)
+        with suppress(ImageError):  # whoever opens it is told
+            check_trainable(reading.cut.cut_size(size), network)
     if len(sizes) > 1 and reading.crop not in ('', CENTRE):
         found = ', '.join('{1}x{0}'.format(*size) for size in sorted(sizes))
         raise ConfigError(f'recordings: pictures of different sizes, {found}; --crop '
                           f'{reading.crop} is another part of each, use --crop {CENTRE} or '
                           'train on them apart')
+
+
+def _first_sizes(paths: Iterable[str | Path],
+                 reading: Reading) -> Iterator[tuple[Path, tuple[int, int]]]:
+    """Yield the first file of each bag, and the (height, width) of a first picture in it."""
+    for bag, camera in itertools.product(
+            (bag for path in paths for bag in find_bags(path)), reading.cameras):
+        size = first_size(bag, next(iter(find_topics(bag, camera))))
+        if size is not None:
+            yield bag[0], size
 
 
 def check_sizes(parts: Sequence[Columns]) -> None:

@@ -36,7 +36,7 @@ from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tap_ros.recording.topic_choice import find_topics, list_paths
 from tqdm import tqdm
 
-FORMAT = 8  # of a cache folder; another number makes all files be decoded again
+FORMAT = 9  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
 

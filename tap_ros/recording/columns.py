@@ -8,7 +8,7 @@ episode goes on in the next one. A message that cannot be used is left out and n
 """
 
 from array import array
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ from tap_ros.errors import ImageError, RecordingError
 from tap_ros.images.crop import CENTRE
 from tap_ros.messages.images import decode_image, decode_mask, is_empty
 from tap_ros.messages.joints import decode_positions, PLACE
-from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.stamps import PROOF, to_nanoseconds
 from tap_ros.messages.topics import BY_COLUMNS, IMAGE
 from tap_ros.recording.damage import describe, FAR, gaps, Loss
 from tap_ros.recording.foreign import open_file
@@ -31,7 +31,9 @@ from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.messages import decode
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import Mark
+from tap_ros.recording.views import first_return, look
 from tap_ros.robots.arm import find_joints, known_arms, MOST_JOINTS
+from tap_ros.text import escaped
 
 PICTURES = ('frame', 'mask', 'goal', 'goal_mask')
 WIDTHS = {'frame': 1, 'twist': 3, 'command': 1, 'joint': 4, 'arm': MOST_JOINTS,
@@ -39,6 +41,7 @@ WIDTHS = {'frame': 1, 'twist': 3, 'command': 1, 'joint': 4, 'arm': MOST_JOINTS,
 NAMES = (*PICTURES, *list(WIDTHS)[1:], 'mark')
 _GOALS = ('goal', 'goal_mask', 'goal_object')
 _CUTTING = ('twist', 'command', 'mark')  # without one of them an episode is no longer known
+_NEAR = 8  # pictures
 _MAX_BYTES = 2**20  # of a message that is no picture
 
 
@@ -87,8 +90,8 @@ def decode_file(path: str | Path, found: Mapping[str, str],
         other, uint8, in the order of the file; they are not to be kept.
     :param reading: Reading; pictures, masks and pixels are cut and scaled as it says.
     :return: Columns without pictures.
-    :raises RecordingError: when no more than half of the pictures are of that size; it names the
-        file.
+    :raises RecordingError: when no more than half of the pictures are of that size, or they are of
+        several cameras by their headers; it names the file.
     """
     first = next((first_size([path], topic) for topic in found if found[topic] == 'frame'), None)
     decoder = _Decoder(open_file(path), found, write, first, reading)
@@ -97,6 +100,7 @@ def decode_file(path: str | Path, found: Mapping[str, str],
             if channel.type_name in BY_COLUMNS[found[channel.topic]].types:
                 decoder.take(channel.topic, channel.type_name, log, data)
         decoder.check_sizes()
+        decoder.check_cameras()
     except RecordingError as error:
         raise RecordingError(f'{path}: {error}') from error
     return decoder.finish()
@@ -139,6 +143,9 @@ class _Decoder:
         self.written: Counter[str] = Counter()  # pictures by name
         self.arms = known_arms()
         self.stamp = 0  # of the newest camera image
+        self.looks = bytearray()  # of the camera images, see views.look
+        self.cameras: deque[tuple[str, tuple[int, int]]] = deque(maxlen=_NEAR)  # of the newest
+        self.returns: Counter[tuple[str, tuple[int, int]]] = Counter()  # to another camera
         self.due = [-FAR, -FAR]  # ns, stamp and log time when the next one is to be taken
         self.decoders: dict[str, Callable[[str, int, Any], object]] = {
             **dict.fromkeys(PICTURES, self._picture), 'twist': self._twist,
@@ -171,6 +178,15 @@ class _Decoder:
                 'size, or say by --crop and --size which square part of them is used')
         self.columns.camera_size = max(alike, key=alike.__getitem__, default=None)
 
+    def check_cameras(self) -> None:
+        """Refuse pictures whose frame_ids, or sizes, alternate."""
+        if self.returns.total() > PROOF:
+            listing = ', '.join(f'frame_id {escaped(frame)} ({w}x{h})' for frame, (h, w)
+                                in sorted(self.returns))
+            raise RecordingError(
+                f'topic {escaped(self.columns.topics["frame"])}: pictures of several cameras '
+                f'alternate: {listing}; start each camera with a name of its own, and record anew')
+
     def finish(self) -> Columns:
         """Make arrays."""
         columns, cut = self.columns, self.reading.cut
@@ -190,6 +206,11 @@ class _Decoder:
         losses = self.file.losses + self.losses
         if losses:
             columns.damage, columns.arrays['gap'] = describe(losses), gaps(losses)
+        if (first := first_return(self.looks)) is not None:
+            columns.damage.append(
+                f'topic {escaped(columns.topics["frame"])}: from picture {first} on two views '
+                'alternate, as where several cameras were started with one name; if so, do not '
+                'learn from it: start each camera with a name of its own, and record anew')
         columns.names = list(self.names)
         columns.shapes = {
             name: [self.written[name], *shape] for name, shape in columns.shapes.items()}
@@ -226,11 +247,22 @@ class _Decoder:
                 *size, *self.size))
         if name == 'frame':
             self._take_due((stamp, log))
+            self._note_camera(message.header.frame_id, size, part)
         self._add(name, log, stamp, self.written[name], values)
         self.written[name] += 1
         self.columns.shapes[name] = list(part.shape)
         self.write(name, part)
         return None
+
+    def _note_camera(self, frame_id: str, size: tuple[int, int], part: np.ndarray) -> None:
+        """Note of which camera a picture is, and what it shows."""
+        shown = look(part)
+        camera = (frame_id or (self.cameras[-1][0] if self.cameras else ''), size)
+        if (camera in self.cameras and camera != self.cameras[-1]
+                and self.looks[-len(shown):] != shown):
+            self.returns[camera] += 1
+        self.cameras.append(camera)
+        self.looks += shown
 
     def _is_due(self, times: tuple[int, int], by_log: bool) -> bool:
         """

@@ -31,6 +31,7 @@ Mark = tuple[str, int, str]  # task, seed, outcome
 
 MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
 _LATE_NS = 5 * 10**9  # likewise where stamps alone tell episodes apart, as no clock begins anew
+_ROUND = 5  # pictures in a row that are as before are no chance
 _LEAST_PAUSE = 0.5  # s, between two demonstrations
 WALL_NS = 10**18  # 2001: clocks of simulations, and those since a start, show less
 
@@ -49,7 +50,7 @@ class Span:
 
 
 def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.ndarray,
-               reading: Reading, source: str) -> list[Span]:
+               reading: Reading, source: str, rounds: np.ndarray) -> list[Span]:
     """
     Read the marks: a list of spans in the order of the log.
 
@@ -59,12 +60,18 @@ def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.nd
     :param reading: Reading; without marks, a longer pause than its gap between two frames begins
         an episode; without pauses, longer episodes than it says are cut into equal parts.
     :param source: what warnings call the recording.
+    :param rounds: rows of frames that begin a round, see find_rounds.
     """
+    pauses = frame.stamp[rounds] - frame.stamp[rounds - 1]
+    if count := int((pauses <= (reading.gap or np.inf) * 1e9).sum()):
+        warnings.warn(
+            f'{source}: its pictures begin anew, {count} times, as where a playback in a loop was '
+            'recorded; each round is an episode of its own', RecordingWarning, stacklevel=4)
     if not marks and reading.gap:
         _propose_gap(frame.stamp, reading, source)
     places = gaps[np.argsort(gaps[:, 0], kind='stable')].tolist()
     spans = _marked(mark, marks, places) if marks else _unmarked(
-        frame.log, frame.stamp, int(reading.gap * 1e9), int(reading.episode_seconds * 1e9))
+        frame.log, frame.stamp, rounds, int(reading.gap * 1e9), int(reading.episode_seconds * 1e9))
     if places:
         spans = [part for span in spans for part in _cut(span, places)]
         spans = sorted((s for s in spans if s.start_log <= s.end_log), key=lambda s: s.start_log)
@@ -120,9 +127,38 @@ def _marked(mark: 'Track', marks: Sequence[Mark], gaps: list[list[int]]) -> list
     return spans
 
 
-def _unmarked(log: np.ndarray, stamps: np.ndarray, pause: int, longest: int) -> list[Span]:
-    """Return spans that end where the camera pauses; times in ns."""
+def find_rounds(stamps: np.ndarray, checksums: np.ndarray) -> np.ndarray:
+    """
+    Find where a playback that was recorded began anew.
+
+    :param stamps, checksums: (N,) of the pictures, in the order in which they were written.
+    :return: rows from which on pictures are as before, in their order: (R,) int64.
+    """
+    count = len(np.unique(checksums))
+    if len(checksums) - count < _ROUND:
+        return np.empty(0, np.int64)
+    back = np.flatnonzero(np.diff(stamps) < -MAX_JITTER_NS) + 1
+    pairs = np.unique(np.stack([stamps, checksums], 1), axis=0)
+    if len(back) and len(pairs) <= len(stamps) - _ROUND:  # the same pictures with their stamps
+        return back
+    places: dict[float, int] = {}  # in its round, by checksum
+    at, known, place = [], [], -1
+    for checksum in checksums.tolist():
+        known.append(checksum in places)
+        place = places.setdefault(checksum, place + 1)
+        at.append(place)
+    found = [i for i in (np.flatnonzero(np.diff(at) <= -_ROUND) + 1).tolist()
+             if (part := at[i:i + 2 * _ROUND]) == sorted(part)
+             and len({p for p, old in zip(part, known[i:]) if old}) >= min(
+                 _ROUND, max(len(part), 2))]
+    return np.array(found, np.int64)
+
+
+def _unmarked(log: np.ndarray, stamps: np.ndarray, rounds: np.ndarray, pause: int,
+              longest: int) -> list[Span]:
+    """Return spans that end where the camera pauses, or begins a round; times in ns."""
     begins = np.flatnonzero(np.diff(stamps) > pause) + 1 if pause else np.empty(0, int)
+    begins = np.union1d(begins, rounds)
     if not len(begins) and longest and len(stamps):
         since = np.maximum.accumulate(stamps) - stamps[0]
         parts = max(-(-int(since[-1]) // longest), 1)  # rounded up

@@ -11,11 +11,12 @@ last link the flange, at a place (m) that is rolled about x (rad).
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
+import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.contract import ACTION_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW, WORLD_FRAME
-from tap_ros.errors import KinematicsError
+from tap_ros.errors import ConfigError, KinematicsError
 from tap_ros.plugins import load_plugin, names
 
 DEFAULT_ARM = 'ur10e'
@@ -190,8 +191,14 @@ def get_arm(name: str) -> Arm:
 
 
 def known_arms() -> list[Arm]:
-    """Return all arms; looking for those of other packages takes milliseconds."""
-    return [get_arm(name) for name in names('tap_ros.arms')]
+    """Return all arms that can be used; looking for those of other packages takes milliseconds."""
+    found = []
+    for name in names('tap_ros.arms'):
+        try:
+            found.append(get_arm(name))
+        except ConfigError as error:
+            warnings.warn(f'{error}; its joints are not looked for', stacklevel=2)
+    return found
 
 
 def find_joints(positions: Mapping[str, float], arms: Sequence[Arm]) -> list[float] | None:

@@ -5,12 +5,15 @@
 from dataclasses import replace
 from itertools import product
 import json
+import re
+from types import SimpleNamespace
+import warnings
 
 import cv2
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, ImageError
 from tap_ros.evaluation import command
 from tap_ros.evaluation.bottleneck import (
     bottleneck_scores,
@@ -222,6 +225,27 @@ def test_the_best_of_more_samples_is_never_worse_and_of_one_is_what_evaluate_mea
 
 def score(words):
     command.prediction(parse(command.Prediction, words))
+
+
+@pytest.mark.parametrize(('crop', 'camera', 'told'), [
+    ('4,0,24', [64, 64], '32x32 pixels .* on the part 4,0,24 of pictures of 64x64'),
+    ('centre', [48, 64], 'on the middle of pictures of 64x48'), ('centre', [64, 64], '')])
+def test_recordings_of_another_camera_are_not_cut_elsewhere_without_a_word(tmp_path, crop, camera,
+                                                                           told):
+    bag = write_bag(tmp_path / 'bag', [EPISODES[0]])
+    made = PredictorNetwork(PredictorConfig(image_size=16, base_width=4))
+    weights = tmp_path / 'weights.safetensors'
+    save_weights(weights, made, 'predictor', made.config, {
+        'settings': {'crop': crop, 'size': 16}, 'camera_size': camera})
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter('always')
+        try:
+            score(['--weights', str(weights), '--recordings', str(bag), '--all'])
+        except ImageError as error:
+            assert crop != 'centre'
+            found.append(SimpleNamespace(message=error))
+    said = [str(one.message) for one in found if 'trained on' in str(one.message)]
+    assert bool(said) == bool(told) and all(re.search(told, text) for text in said)
 
 
 @pytest.mark.parametrize('options', [

@@ -54,6 +54,8 @@ def trained(part, size, camera=(480, 640), network=64):
 def test_pictures_that_stream_in_are_cut_as_in_training():
     assert trained('centre', 64).of((480, 640), 'start') == Crop('centre', 64)
     assert trained('centre', 64).of((720, 1280), 'start') == Crop('centre', 64)  # another camera
+    assert trained('centre', 64).unlike((720, 1280), 'start')
+    assert not trained('centre', 64).unlike((240, 320), 'start')
     assert trained('80,0,480', 64).of((480, 640), 'start') == Crop('80,0,480', 64)
     assert not trained('centre', 64).of((64, 64), 'start')  # cut already
     assert not trained('', 0, (64, 64)).of((480, 640), 'start')  # never were; it is refused later

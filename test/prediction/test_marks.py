@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of marks: their file, what is learned from them and trained with it, and their page."""
 
+from contextlib import suppress
 from dataclasses import replace
 import json
+import socket
 import threading
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -11,7 +13,9 @@ from urllib.request import Request, urlopen
 from made_episodes import make_episode, write_bag
 import numpy as np
 import pytest
+from tap_ros.cli import main
 from tap_ros.errors import ConfigError
+from tap_ros.files import only_keeper
 from tap_ros.prediction.mark_command import Marking, Server
 from tap_ros.prediction.marks import learn_marks
 from tap_ros.prediction.preference import Preference
@@ -146,6 +150,9 @@ def test_the_page_shows_frames_and_writes_marks_at_once(page, bag, store):
     before = path.read_bytes()
     for place, data, headers, code in (
             ('mark', b'{"episode": 1, "frames": [0]}', {}, 400), ('mark', b'x', {}, 400),
+            ('mark', b'{"episode": 1, "frames": ""}', {}, 400), ('mark', b'[' * 60000, {}, 400),
+            ('mark', b' ' * 70000, {}, 413), ('mark', b'', {'Content-Length': '-1'}, 413),
+            (f'frame/{"9" * 5000}/0', None, {}, 404),
             ('mark', b'{"episode": 1, "frames": [1]}', {'Origin': 'http://evil.example'}, 403),
             ('state', None, {'Host': 'evil.example'}, 403), ('frame/99/0', None, {}, 404),
             ('../setup.py', None, {}, 404)):
@@ -153,3 +160,37 @@ def test_the_page_shows_frames_and_writes_marks_at_once(page, bag, store):
             ask(place, data, **headers)
         assert error.value.code == code, (place, data)
     assert path.read_bytes() == before
+    path.with_name(f'{path.name}.part').mkdir()  # nothing can be written
+    with pytest.raises(HTTPError) as error:
+        ask('mark', b'{"episode": 1, "frames": [1, 2]}')
+    assert error.value.code == 507 and b'cannot be written' in error.value.read()
+    assert json.load(ask('state')) == state
+
+
+def test_connections_to_the_page_are_few_and_end_in_time(page, monkeypatch):
+    ask, _ = page
+    place = ask('state').url.split('/')[2].split(':')
+    for name, value in (('LONGEST_S', 1e9), ('MAX_CONNECTIONS', 4)):
+        monkeypatch.setattr(f'tap_ros.prediction.mark_command.{name}', value)
+    idle = [socket.create_connection(place) for _ in range(4)]
+    with socket.create_connection(place) as one:
+        assert one.recv(1) == b''
+    for one in idle:
+        one.close()
+    while True:
+        with suppress(OSError):
+            assert ask('state').read()
+            break
+    monkeypatch.setattr('tap_ros.prediction.mark_command.LONGEST_S', 0.2)
+    with socket.create_connection(place) as slow:
+        slow.sendall(b'POST /mark HTTP/1.0\r\nContent-Le')
+        assert slow.recv(1) == b''
+    assert json.load(ask('state'))
+
+
+def test_a_second_server_of_a_file_is_refused(bag, tmp_path, capsys):
+    path = tmp_path / 'marks.json'
+    with only_keeper(path):
+        assert main(['mark', str(bag), '--marks', str(path), '--port', '0']) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        f'error: {path}: another process keeps it; end that one, or choose another file']

@@ -94,3 +94,8 @@ def test_the_part_that_is_used_is_asked_for_or_that_of_the_training(episode, tmp
         assert np.array(told, float) == pytest.approx(
             (subgoal.expected_pixels + 0.5) * 3 - 0.5 + [32, 0], abs=0.2)
     assert '--crop centre' in refusal(capsys, *map(str, files))
+    save_weights(weights, network, 'predictor', network.config, {
+        'settings': {'crop': 'centre', 'size': 64}, 'camera_size': [144, 256]})
+    assert main(['predict', *map(str, files), '--weights', str(weights), '--out',
+                 str(tmp_path / 'out.png')]) == 0
+    assert 'on the middle of pictures of 256x144' in capsys.readouterr().err

@@ -7,13 +7,13 @@ import io
 import re
 
 import cv2
-from made_bags import camera, IMAGE, message, read, record, SECOND, write_mcap
+from made_bags import camera, IMAGE, message, read, record, SECOND, shown, write_mcap
 from made_episodes import make_episode
 import numpy as np
 from PIL import Image as Picture
 import pytest
 from tap_ros.errors import RecordingError
-from tap_ros.images.crop import Crop
+from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.recording.bags import list_topics, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import encode
@@ -26,9 +26,9 @@ TOPIC = '/camera/color/image_raw/compressed'
 
 
 def scene(t, size=(48, 64)):
-    """Return a smooth picture with a dot that moves."""
+    """Return a smooth picture with a dot that moves; none of the next 99 is the same."""
     y, x = np.mgrid[:size[0], :size[1]]
-    picture = np.stack([x * 255 // size[1], y * 255 // size[0], np.full_like(x, 90)], -1)
+    picture = np.stack([x * 255 // size[1], y * 255 // size[0], np.full_like(x, 90 + t % 99)], -1)
     return cv2.circle(picture.astype(np.uint8), (20 + t % 20, 24), 4, (250, 40, 20), -1)
 
 
@@ -179,6 +179,11 @@ def test_other_recordings_are_read_as_those_of_the_training(tmp_path):
     assert reading_like(training, [tmp_path / 'b'], '/front') == replace(
         expected, image_topic='/front')
     assert reading_like({}, [tmp_path / 'b']) == Reading()
+    # As nodes do: pictures that are cut already stay, larger ones of the same camera are scaled.
+    for side, crop, cut in ((16, Crop('8,0,96', 16), Crop()), (64, Crop(), Crop(size=16))):
+        bag = record(tmp_path / str(side), [camera(1, np.zeros((side, side, 3), np.uint8))])
+        found = reading_like({}, [bag], trained=TrainedCrop(crop, (96, 128), (16, 16)))
+        assert found.cut == cut
 
 
 def test_unmarked_recordings_are_cut_by_pauses_or_by_length(tmp_path):
@@ -241,3 +246,59 @@ def test_of_several_bags_each_is_an_episode(tmp_path):
         record(tmp_path / 'bags' / name, map(camera, range(1, 51)))
     assert [len(e) for e in read(tmp_path / 'bags')[0]] == [50, 50]
     assert len(open_recordings(tmp_path / 'bags' / 'a')) == 3
+
+
+@pytest.mark.parametrize('restamped', [False, True])
+def test_each_round_of_a_recorded_loop_is_an_episode(tmp_path, restamped):
+    messages = [camera(logged if restamped else 1 + i / 10, value=5 * i, log=logged)
+                for n in range(3) for i in range(20) if (n, i) not in ((1, 0), (1, 7), (2, 12))
+                for logged in [9 + 2.5 * n + i / 10]]
+    found, told = read(record(tmp_path / 'bag', messages))
+    assert [one[0] for one in shown(found)] == [0, 5, 0] and sum(map(len, found)) == 57
+    assert all(sorted(one) == one for one in shown(found))
+    assert any('its pictures begin anew, 2 times' in text for text in told)
+    # A scene that looks now and then as before, to the bit, is none.
+    values = [*range(30), *range(30, 10, -1), 3, 3, *range(50, 70), 3, 0]
+    found, told = read(record(tmp_path / 'other', [
+        camera(1 + i / 10, value=value) for i, value in enumerate(values)]))
+    assert shown(found) == [values] and not told
+
+
+def views(n, cameras, every=1):
+    """Return (seconds, number of the camera, picture) of cameras that look at one scene."""
+    rng = np.random.default_rng(3)
+    walls = [rng.integers(60, 200, (6, 8, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+             for _ in range(cameras)]
+    return [(1 + t / 10 + 0.007 * k, k, cv2.circle(
+        walls[k].copy(), (5 + t, 24), 4, (250, 40, 20), -1)) for t in range(n)
+        for k in range(cameras) if not k or (t > 5 and t % every == 0)]
+
+
+@pytest.mark.parametrize(('cameras', 'every', 'form'), [
+    (2, 1, ''), (3, 1, ''), (2, 3, ''), (2, 1, 'JPEG')])
+def test_several_cameras_on_one_topic_are_told_of(tmp_path, cameras, every, form):
+    shot = views(40, cameras, every)
+    for named in (True, False):
+        stamp = [{'header': {'stamp': {'sec': int(t), 'nanosec': round(t % 1 * SECOND)},
+                             'frame_id': f'eye_{k}' if named else 'eye'}} for t, k, _ in shot]
+        bag = record(tmp_path / str(named), [
+            camera(t, picture, **header) if not form else (TOPIC, COMPRESSED, encode(
+                COMPRESSED, {**header, 'format': 'jpeg', 'data': packed(picture)}), round(
+                    t * SECOND)) for (t, _, picture), header in zip(shot, stamp)])
+        if named:
+            with pytest.raises(RecordingError, match='frame_id eye_0 .64x48., frame_id eye_1'):
+                read(bag)
+        else:
+            assert any('two views alternate, as where several' in text for text in read(bag)[1])
+
+
+@pytest.mark.parametrize('spoil', [
+    lambda i, picture: picture, lambda i, picture: (picture * (0.4 + 0.6 * (i % 2))),
+    lambda i, picture: picture * np.linspace(1, 0.2 + 0.8 * (i % 2), 64)[:, None],
+    lambda i, picture: picture * (i % 4 > 0), lambda i, picture: np.roll(picture, 5 * i, 1),
+    lambda i, picture: picture + np.random.default_rng(i).normal(0, 20, picture.shape)])
+def test_light_that_flickers_noise_and_black_pictures_are_no_second_camera(tmp_path, spoil):
+    _, told = read(record(tmp_path / 'bag', [
+        camera(t, np.clip(spoil(i, picture), 0, 255).astype(np.uint8))
+        for i, (t, _, picture) in enumerate(views(60, 1))]))
+    assert not told

@@ -15,7 +15,7 @@ from tap_ros.contract import (
     step_budget,
     WORLD_FRAME,
 )
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, TapError
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
@@ -111,7 +111,7 @@ def load_planner(parameters: Parameters) -> VisualMPC:
 
     :param parameters: of the node.
     :raises WeightsError: when the file cannot be used.
-    :raises ConfigError: when the device is not available.
+    :raises ConfigError: when the device is not available, or the solver cannot plan.
     """
     check_device(parameters['device'])
     config = with_preset(
@@ -120,8 +120,15 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     mpc = VisualMPC.load(weights_file(parameters['weights']), config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
-    mpc.plan(Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels),
-             mpc.goal(pixels))
+    scene = Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels)
+    try:
+        mpc.plan(scene, mpc.goal(pixels))
+    except TapError:
+        raise
+    except Exception as error:
+        raise ConfigError(
+            f'solver {parameters["solver"]}: cannot plan: {type(error).__name__}: '
+            f'{escaped(error, 200)}; choose another, or mend the package that it is of') from error
     return mpc
 
 

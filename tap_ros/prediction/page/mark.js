@@ -58,9 +58,13 @@ function open(i) {
 async function send() {
   const frames = marks().includes(frame) ? marks().filter((t) => t !== frame)
     : [...marks(), frame].sort((a, b) => a - b);
-  const answer = await fetch('mark', {method: 'POST', body: JSON.stringify({episode, frames})});
-  at('error').textContent = answer.ok ? '' : await answer.text();
-  if (answer.ok) state = await answer.json();
+  try {
+    const answer = await fetch('mark', {method: 'POST', body: JSON.stringify({episode, frames})});
+    at('error').textContent = answer.ok ? '' : await answer.text();
+    if (answer.ok) state = await answer.json();
+  } catch {
+    at('error').textContent = 'Not marked: the server does not answer. Start it again.';
+  }
   draw();
 }
 
