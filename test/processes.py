@@ -50,6 +50,18 @@ def until(accept, seconds=30.0, pause=0.02):
     return found
 
 
+@contextmanager
+def crowd(count):
+    """Keep so many processes busy meanwhile."""
+    busy = [subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for one in busy:
+            one.kill()
+            one.wait()
+
+
 def _hear_signals():
     """Take back what nohup and background jobs of a shell ignore."""
     for number in (signal.SIGINT, signal.SIGHUP):
