@@ -8,6 +8,7 @@ Modules beside this file (domains, made_episodes, processes) can be imported by 
 
 import os
 import signal
+import sys
 
 from domains import reserve_domain
 from hypothesis import HealthCheck, settings
@@ -39,6 +40,20 @@ def pytest_collection_modifyitems(config, items):
         faults = [item for item in items if item.get_closest_marker('fault')]
         items[:] = [item for item in items if not item.get_closest_marker('fault')]
         config.hook.pytest_deselected(items=faults)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Fail a test in which a node logged a traceback or an error that no `errors` mark names."""
+    report = yield
+    processes = sys.modules.get('processes')  # else there is no node
+    if call.when == 'teardown' and processes is not None:
+        wrong = processes.unexpected(report.capstderr + processes.news(), [
+            pattern for other in item.session.items if other.path == item.path
+            for mark in other.iter_markers('errors') for pattern in mark.args])
+        if wrong and report.passed:
+            report.outcome, report.longrepr = 'failed', wrong
+    return report
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist

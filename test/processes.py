@@ -22,8 +22,24 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from tap_ros.nodes.calls import call, CallError, Spinner
 from tap_ros.nodes.heartbeat import Heartbeat
+from tap_ros.nodes.node_processes import errors_in
 
 ROOT = Path(__file__).parents[1]
+_unread = []  # nodes with a log that was not read to its end
+
+
+def news():
+    """Return what the nodes of this test run have logged since this was called before."""
+    living = [process for process in _unread if process.alive]
+    text = '\n'.join(process.news() for process in _unread)
+    _unread[:] = living
+    return text
+
+
+def unexpected(log, expected):
+    """Return what is wrong with the logs of nodes, '' if nothing is; see errors_in."""
+    lines = errors_in(log, expected)
+    return f'{len(lines)} unexpected lines in logs:\n' + '\n'.join(lines[:10]) if lines else ''
 
 
 def until(accept, seconds=30.0, pause=0.02):
@@ -32,6 +48,18 @@ def until(accept, seconds=30.0, pause=0.02):
     while not (found := accept()) and time.monotonic() < deadline:
         time.sleep(pause)
     return found
+
+
+@contextmanager
+def crowd(count):
+    """Keep so many processes busy meanwhile."""
+    busy = [subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for one in busy:
+            one.kill()
+            one.wait()
 
 
 def _hear_signals():
@@ -65,6 +93,9 @@ class NodeProcess:
             self.process = subprocess.Popen(
                 self._command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
                 cwd=ROOT, start_new_session=True, preexec_fn=_hear_signals)
+        if self not in _unread:
+            self._read = self._from
+            _unread.append(self)
         return self
 
     @property
@@ -76,6 +107,13 @@ class NodeProcess:
     def text(self):
         """Everything that the present process has printed."""
         return self.log.read_bytes()[self._from:].decode(errors='replace')
+
+    def news(self):
+        """Return the whole lines that were not read yet."""
+        new = self.log.read_bytes()[self._read:] if self.log.exists() else b''
+        new = new[:new.rfind(b'\n') + 1] if self.alive else new
+        self._read += len(new)
+        return new.decode(errors='replace')
 
     def wait_for(self, words, timeout_s=90):
         """Wait until the node prints something."""

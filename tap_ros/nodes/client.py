@@ -283,14 +283,15 @@ class Client:
         goal = self.goal(before, objects, left())
         return self.camera(goal.stamp_ns - 1, objects, left()), goal
 
-    def select(self, pixels: Mapping[str, Sequence[float]]) -> None:
+    def select(self, pixels: Mapping[str, Sequence[float]], stamp_ns: int = 0) -> None:
         """
         Have the tracker follow other objects {name: (u, v)}, clicked in the newest picture.
 
+        :param stamp_ns: of the picture that was clicked: none that is older is used.
         :raises CallError: with the reason, such as a click on the robot; then nothing changes.
         """
         u, v = _pixels(list(pixels.values()), 'pixels').T.tolist()
-        self.call('select', names=_names(pixels), u=u, v=v)
+        self.call('select', names=_names(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start nodes as processes of their own, with logs, and end them all."""
 
+from collections.abc import Iterable
 import os
 from pathlib import Path
 import re
@@ -15,10 +16,25 @@ from tap_ros.errors import TapError
 import yaml
 
 READY_S, LOOK_S = 120.0, 0.1
+# What no log should have: Python's and C++'s last words, and what rclpy calls an error.
+_WRONG = re.compile(r'Traceback \(most recent call last\)|^Fatal Python error|^terminate called|'
+                    r'^\[(?:ERROR|FATAL)\] \[')
 
 
 class NodeEnded(TapError):
     """A node's process ended by itself."""
+
+
+def errors_in(log: str, expected: Iterable[str] = ()) -> list[str]:
+    """
+    Return the lines of a node's log that no healthy node prints: tracebacks, ERROR and FATAL.
+
+    :param log: its text.
+    :param expected: patterns of lines that were provoked.
+    """
+    known = [re.compile(pattern) for pattern in expected]
+    return [line for line in log.splitlines()
+            if _WRONG.search(line) and not any(pattern.search(line) for pattern in known)]
 
 
 class NodeProcesses:
@@ -102,6 +118,9 @@ class NodeProcesses:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
         """End all nodes, politely first; that started first, which may record, as the last."""
         processes = list(self._processes.values())
         for group in (processes[1:], processes[:1]):

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults: each test makes many trials and, with --report, leaves a row of a table."""
 
+import sys
+
 from fault_report import save, Trials
 import pytest
 
@@ -10,9 +12,15 @@ import pytest
 def trials(request):
     """Return the Trials of the test's fault."""
     report = request.config.getoption('--report')
+    expected = [pattern for mark in request.node.iter_markers('errors') for pattern in mark.args]
+
+    def wrong():
+        processes = sys.modules.get('processes')  # else there is no node
+        return processes.unexpected(processes.news(), expected) if processes else ''
+
     # Without a report other tests, and other programs, may run meanwhile.
     return Trials(request.node.get_closest_marker('fault').kwargs,
-                  request.config.getoption('--share'), patience=1.0 if report else 8.0)
+                  request.config.getoption('--share'), 1.0 if report else 8.0, wrong)
 
 
 @pytest.fixture(scope='session')
@@ -31,6 +39,8 @@ def pytest_pyfunc_call(pyfuncitem):
     try:
         result = yield
         if trials is not None:
+            if why := trials.wrong():  # said after the last trial
+                trials.record(why)
             assert trials.held == trials.tried > 0, trials.why_not()
         return result
     except BaseException as raised:

@@ -20,7 +20,7 @@ from experiments.paper.figures import COLOURS, INK, new_figure, to_png
 import pytest
 from tap_ros.errors import TapError
 from tap_ros.files import write_atomically, write_rows
-from tap_ros.text import escaped
+from tap_ros.text import escaped, listing
 
 ROOT = Path(__file__).parents[2]
 MAX_REASONS = 4
@@ -28,10 +28,11 @@ HEAD = """\
 # Faults
 
 Each row is a fault that was injected into real nodes, processes of their own that talk over DDS,
-or into a disk. *Held*: trials in which what must happen did happen. Numbers are the worst of all
-trials unless said otherwise. `make faults` (about four hours) makes this page and
-[faults.json](faults.json), which has each row's machine, date and commit; `python -m pytest -m
-fault` tries each fault a few times. Damaged recordings and weights are in `make test`.
+or into a disk. *Held*: trials in which what must happen did happen, and no node logged a traceback
+or an error that the fault does not explain. Numbers are the worst of all trials unless said
+otherwise. Made by `make faults` in {minutes:.0f} minutes, {dates}, commit {commits}, on
+{machines}; [faults.json](faults.json) has each row's. `python -m pytest -m fault` tries each fault
+a few times. Damaged recordings and weights are in `make test`.
 
 ![slowest reaction of all trials, and what was promised](faults.png)
 
@@ -64,11 +65,12 @@ class Trials:
     :param share: of the fault's count that is tried; at least one trial is made.
     :param patience: factor of what a promise says in seconds; more than 1 on a machine that does
         something else meanwhile.
+    :param wrong: says what is wrong in the logs of nodes since it was asked before, '' if nothing.
     :ivar note: for the row, beside the figure.
     """
 
-    def __init__(self, mark, share, patience):
-        self.mark, self.share, self.patience = mark, share, patience
+    def __init__(self, mark, share, patience, wrong=str):
+        self.mark, self.share, self.patience, self.wrong = mark, share, patience, wrong
         self.count = max(1, round(mark['count'] * share))
         self.tried = self.held = 0
         self.note = ''
@@ -80,9 +82,15 @@ class Trials:
 
     @contextmanager
     def one(self):
-        """Take down a trial, which held if the with-block raises neither assertion nor error."""
+        """
+        Take down a trial.
+
+        It held if the with-block raises neither assertion nor error, and no log has one.
+        """
         try:
             yield
+            why = self.wrong()
+            assert not why, why
         except (AssertionError, TapError, pytest.fail.Exception) as error:
             self.record(str(error).split('\nassert ')[0] or 'no reason was given')
         else:
@@ -173,7 +181,10 @@ def page(rows):
         lines.setdefault((row['injected'], row['promise']), []).append(row)
     missed = [f'- {row["injected"]}: {row["held"]} of {row["tried"]}.\n' for row in rows
               if row['held'] < row['tried']]
-    return HEAD + ''.join(_line(*texts, rows) for texts, rows in lines.items()) + ''.join(
+    head = HEAD.format(minutes=sum(row['seconds'] for row in rows) / 60, **{
+        f'{key}s': listing(sorted({row[key] for row in rows}))
+        for key in ('date', 'commit', 'machine')})
+    return head + ''.join(_line(*texts, rows) for texts, rows in lines.items()) + ''.join(
         ['\n## What was missed\n\n', *missed] if missed else '')
 
 

@@ -61,7 +61,7 @@ def run_on_full_disk(*words):
 
 @pytest.mark.parametrize('what', [
     pytest.param(what, id=f'disk-full-{what}', marks=fault(
-        FULL, CLEAR, 20, 's until it ended (median)', statistics.median))
+        FULL, CLEAR, 8, 's until it ended (median)', statistics.median))
     for what in ('collect', 'train')])
 def test_(trials, tmp_path, what):
     random, source = np.random.default_rng(0), tmp_path / 'source'
@@ -108,7 +108,7 @@ def read_bag(folder):
 
 @pytest.mark.ros
 @fault('the disk is full while recorder_node records', 'error in log and answer, exit code not 0; '
-       'what was recorded can be read', 20)
+       'what was recorded can be read', 8)
 def test_disk_full_recorder(trials, rig, tmp_path):
     random = np.random.default_rng(0)
     rig.need()

@@ -222,7 +222,7 @@ class Target:
 
 
 @fault('generated messages: wrong sizes, extreme numbers, control characters', 'no node ends, '
-       'each call is answered, good calls are answered well in between', 100_000)
+       'each call is answered, good calls are answered well in between', 50_000)
 def test_generated_messages(rig, trials):
     target, seed = Target(rig), 0
     try:

@@ -4,13 +4,16 @@
 
 from dataclasses import replace
 import io
+import json
 from pathlib import Path
 import re
 
 from mcap.reader import make_reader
 import numpy as np
 from PIL import Image, ImageSequence
+from processes import crowd
 import pytest
+from tap_ros.errors import TapError
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.nodes.demo import command
 from tap_ros.nodes.demo.film import (
@@ -25,10 +28,12 @@ from tap_ros.nodes.demo.film import (
     SIDE,
     START_MS,
 )
+from tap_ros.nodes.demo.lane import Lane
 from tap_ros.nodes.demo.report import gains, results_table, shown, summary, write_report
 from tap_ros.recording.cache import open_recordings
 
 LAYOUT = Path(__file__).parents[2] / 'config' / 'layouts' / 'tap_ros.json'
+SEED = 2_000_000
 GREYS = {'direct': (0, 60, 120, 180), 'subgoal': (240, 90)}  # one run is shorter
 START, GOALS = np.array([[20.0, 40.0], [90.0, 40.0]]), np.array([[20.0, 100.0], [20.0, 40.0]])
 
@@ -115,6 +120,35 @@ def test_the_film_shows_each_run_to_its_end_and_what_it_heads_for():
     assert milliseconds == [START_MS, FRAME_MS, FRAME_MS, HOLD_MS]
 
 
+@pytest.mark.parametrize('line, code', [
+    ('[INFO] [1.0] [sim_node]: [ERROR]', 0),
+    ('[ERROR] [1.0] [sim_node]: service: Traceback (most recent call last):', 1)])
+def test_what_was_done_is_kept_what_cannot_be_is_counted_and_logs_are_read(
+        line, code, tmp_path, capsys, monkeypatch):
+    page = tmp_path / 'demo' / 'report.html'
+
+    def run_scenes(_, folder, __):
+        yield scene(7)
+        assert '<h2>order2 7</h2>' in page.read_text()
+        yield TapError('the reason\nand more')
+        (folder / 'logs').mkdir()
+        (folder / 'logs' / 'sim_node.log').write_text(line)
+        yield scene(9, 0.03)
+
+    monkeypatch.setattr(command, 'run_scenes', run_scenes)
+    options = command.Options(scenes=3, tasks=('order2',), seed=7, out=str(page.parent))
+    assert command.run(options) == code
+    assert (f'2 finished, 1 left out; {code} tracebacks and errors in the logs'
+            in capsys.readouterr().out)
+    assert 'order2 8: the reason.' in page.read_text()
+    rows = json.loads((page.parent / 'scenes.json').read_text())
+    assert [row['seed'] for row in rows] == [7, 9]
+    assert rows[0]['direct'] == scene(7).runs['direct'].distances.tolist()
+    monkeypatch.setattr(command, 'run_scenes', lambda *_: iter([TapError('a reason')]))
+    with pytest.raises(TapError, match='no scene could be finished; a reason'):
+        command.run(options)
+
+
 @pytest.mark.slow
 def test_real_nodes_push_tracked_objects_of_two_tasks_with_one_start(tmp_path, capsys):
     assert command.run(command.Options(
@@ -122,12 +156,32 @@ def test_real_nodes_push_tracked_objects_of_two_tasks_with_one_start(tmp_path, c
     ends = re.findall(r'(\w+) 2000000 .* in 2 steps .* in 2 steps', capsys.readouterr().out)
     assert ends == ['push2', 'order2']
     assert {path.name for path in (tmp_path / 'demo').iterdir()} == {
-        'logs', 'recording', 'push2.webp', 'order2.webp', 'report.html'}
+        'logs', 'recording', 'push2.webp', 'order2.webp', 'report.html', 'scenes.json'}
     with (tmp_path / 'demo' / 'recording' / 'recording_0.mcap').open('rb') as file:
         bag = make_reader(file).get_summary()
     recorded = {bag.channels[each].topic for each in bag.statistics.channel_message_counts}
     wanted = set(re.findall(r'": "(/[a-z_/]+)', LAYOUT.read_text()))
     assert len(wanted) > 6 and wanted <= recorded, 'a panel would stay empty'
+
+
+@pytest.mark.slow
+def test_a_scene_ends_the_same_on_a_busy_machine_and_after_a_node_has_ended(tmp_path):
+    options = command.Options(scenes=1, tasks=('push2',), step_budget=3)
+    lane = Lane(options, tmp_path, 'direct', ('push2',))
+    lane.start()
+    try:
+        lane.wait_until_ready()
+        alone = lane.run('push2', SEED)
+        with crowd(6):
+            beside = lane.run('push2', SEED)
+        lane._processes._processes['sim_node'].kill()
+        ended = lane.run('push2', SEED)
+        after = lane.run('push2', SEED)
+    finally:
+        lane.close()
+    assert 'sim_node ended with exit code -9' in str(ended)
+    for other in (beside, after):
+        assert np.array_equal(other.runs['direct'].distances, alone.runs['direct'].distances)
 
 
 @pytest.mark.slow

@@ -200,6 +200,7 @@ def test_each_bound_is_named_and_what_is_refused_touches_nothing(services):
     assert latent.answer(**WITH_GOAL).subgoals == before
 
 
+@pytest.mark.errors('no such weights file')
 def test_a_node_answers_while_it_is_active_alone_by_the_weights_of_that_time(
         client, files, tmp_path):
     mine = tmp_path / 'mine.safetensors'

@@ -84,6 +84,7 @@ def test_the_simulator_tells_where_its_robot_is(sim, client):
     assert gripper[0] - before[0] > 0.03
 
 
+@pytest.mark.errors('no robot mask: ')
 def test_without_a_robot_or_its_joints_there_is_no_mask_and_the_reason(client):
     cameras = client.create_publisher(CameraInfo, 'alone/camera/camera_info', STREAM)
     diagnostics = Newest(client, DiagnosticArray, '/diagnostics', 10)

@@ -82,6 +82,7 @@ def scene(sim, client):
     assert node.end() == 0
 
 
+@pytest.mark.errors('goal/image: expected 128x128')
 def test_clicked_objects_are_followed_and_found_in_the_goal(scene, client):
     start_ns, goal_ns = scene.reset()
     select(scene.client, scene.true_clicks(start_ns))

@@ -26,10 +26,11 @@ from sim_bridge.tasks.tasks import get_task, task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.contract import ROBOT_MASKS, step_budget
 from tap_ros.errors import ConfigError, TapError
-from tap_ros.files import free_folder
+from tap_ros.files import free_folder, write_rows
 from tap_ros.nodes.demo.film import film, Scene
 from tap_ros.nodes.demo.lane import run_scenes
 from tap_ros.nodes.demo.report import (
+    as_row,
     gains,
     MODES,
     results_table,
@@ -37,7 +38,7 @@ from tap_ros.nodes.demo.report import (
     summary,
     write_report,
 )
-from tap_ros.nodes.demo.watch import Refused
+from tap_ros.nodes.node_processes import errors_in
 from tap_ros.options import Folder, one_of
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
@@ -52,6 +53,7 @@ TOLD = {  # by whether objects are tracked
           'and found in the goal picture; the ground truth of the simulator only measures '
           'distances and draws numbers and arrows.',
     False: 'Object pixels at every step, and the distances, are ground truth of the simulator.'}
+MOST_SHOWN = 10  # of the errors in logs
 REPEATS = ('All runs are in lock-step: the same seeds end the same on a busy machine, only the '
            'seconds differ. Another processor can differ in the last digits of a plan.')
 
@@ -123,21 +125,36 @@ class Options:
 
 def run(args: Options) -> int:
     """
-    Run the demo and leave a recording, logs, a film and a page.
+    Run the demo and leave a recording, logs, films and a page, which grows with each scene.
 
     :param args: Options.
-    :return: exit code.
+    :return: exit code, 1 where the logs of the nodes have errors.
+    :raises TapError: when no scene could be finished.
     """
     args.check()
     os.environ.setdefault('OMP_NUM_THREADS', '1')  # of the nodes, which share the cores
     folder = new_folder(args.out)
     print(f'starting nodes; their logs are in {folder / "logs"}', flush=True)
-    begin, scenes = time.monotonic(), list[Scene]()
-    left_out, drawn = list[str](), dict[str, Future[bytes]]()
+    begin, scenes, left_out = time.monotonic(), list[Scene](), dict[str, str]()
+    drawn, films = dict[str, Future[bytes]](), dict[str, bytes]()
+
+    def write_page() -> None:
+        write_rows(folder / 'scenes.json', map(as_row, scenes))
+        reasons = '; '.join(f'{name}: {why}' for name, why in left_out.items()) or 'none'
+        write_report(
+            folder / 'report.html', scenes, films,
+            f'{len(scenes)} of {len(args.plan)} scenes, from seed {args.seed} on, which are in no '
+            f'recording, training or table. Left out, as they could not be finished: {reasons}. '
+            f'{TOLD[args.tracked]} {REPEATS}', {
+                'date': time.strftime('%Y-%m-%d %H:%M'),
+                'time': f'{time.monotonic() - begin:.0f} s',
+                'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
+                'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'})
+
     with ThreadPoolExecutor(1) as pool:
         for (task, seed), scene in zip(args.plan, run_scenes(args, folder, drawn)):
-            if isinstance(scene, Refused):
-                left_out.append(f'{task} {seed}')
+            if isinstance(scene, TapError):
+                left_out[f'{task} {seed}'] = str(scene).splitlines()[0]
                 print(f'  {task} {seed}   left out: {scene}', flush=True)
                 continue
             scenes.append(scene)
@@ -146,27 +163,26 @@ def run(args: Options) -> int:
             print(f'  {task} {seed}   ' + '   '.join(
                 f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps'
                 for mode, name in MODES.items() for run in [scene.runs[mode]]), flush=True)
-    if not scenes:
-        raise TapError('no scene could be run')
-    films = {}
-    for caption, scene in shown(scenes).items():
-        films[caption] = drawn[scene.task].result() if scene.task in drawn else film(scene)
-        (folder / f'{scene.task}.webp').write_bytes(films[caption])
-        print(f'film       {folder / scene.task}.webp')
-    write_report(
-        folder / 'report.html', scenes, films,
-        f'Scenes from seed {args.seed} on, which are in no recording, training or table. Left '
-        f'out, as the tracker refused the clicks: {", ".join(left_out) or "none"}. '
-        f'{TOLD[args.tracked]} {REPEATS}', {
-            'date': time.strftime('%Y-%m-%d %H:%M'),
-            'time': f'{time.monotonic() - begin:.0f} s',
-            'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
-            'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'})
-    print(f'\n{results_table(summary(scenes))}\n')
-    print(f'recording  {folder / "recording"}')
-    print(f'page       {folder / "report.html"}')
+            write_page()  # whatever ends the demo, what was done is there
+    wrong = [f'{log}: {line}' for log in sorted((folder / 'logs').rglob('*.log'))
+             for line in errors_in(log.read_text(errors='replace'))]
+    for line in wrong[:MOST_SHOWN]:
+        print(line)
+    if scenes:
+        for caption, scene in shown(scenes).items():
+            films[caption] = drawn[scene.task].result() if scene.task in drawn else film(scene)
+            (folder / f'{scene.task}.webp').write_bytes(films[caption])
+            print(f'film       {folder / scene.task}.webp')
+        write_page()
+        print(f'\n{results_table(summary(scenes))}\n')
+        print(f'recording  {folder / "recording"}')
+        print(f'page       {folder / "report.html"}')
     print(f'time       {time.monotonic() - begin:.0f} s')
-    return 0
+    print(f'scenes     {len(scenes)} finished, {len(left_out)} left out; '
+          f'{len(wrong)} tracebacks and errors in the logs of the nodes')
+    if not scenes:
+        raise TapError(f'no scene could be finished; {left_out.popitem()[1]}')
+    return int(bool(wrong))
 
 
 def new_folder(wanted: str | Path) -> Path:

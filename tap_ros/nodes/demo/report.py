@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import io
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jinja2 import Environment
 import numpy as np
@@ -92,6 +92,12 @@ def write_report(path: str | Path, scenes: Sequence[Scene], films: Mapping[str, 
         words=in_words(rows[-1]), columns=COLUMNS, rows=[row.texts() for row in rows], note=note,
         facts=facts, films=[(caption, _uri(data)) for caption, data in films.items()],
         scenes=[(f'{scene.task} {scene.seed}', list(_stills(scene))) for scene in scenes]))
+
+
+def as_row(scene: Scene) -> dict[str, Any]:
+    """Return what is compared of a scene: metres of each object to its goal after each step."""
+    return {'task': scene.task, 'seed': scene.seed, **{
+        mode: scene.runs[mode].distances.tolist() for mode in MODES}}
 
 
 def shown(scenes: Sequence[Scene]) -> dict[str, Scene]:

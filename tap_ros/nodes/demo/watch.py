@@ -21,7 +21,6 @@ from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.tracking.protocols import LOST
 from tap_ros.training.robot_mask import nearest_free
 
-FOUND_S = 10.0  # that the tracker may take to find the objects of a goal
 CLICKS, SLIP = 5, 0.015  # tries to click; how far beside the first the others are, of a picture
 
 
@@ -118,8 +117,10 @@ def click(client: Client, watch: Watch, seed: int, start: View,
     deadline, found = time.monotonic() + client.timeout_s, None
     while found is None:
         try:  # right after a reset the tracker may not have heard of the scene yet
-            client.select(dict(zip(names, nearest_free(places, hidden).tolist())))
-            found = watch.at('goal/objects', goal.stamp_ns, FOUND_S, lambda one: one.objects)
+            client.select(dict(zip(names, nearest_free(places, hidden).tolist())), start.stamp_ns)
+            found = watch.at('goal/objects', goal.stamp_ns, accept=lambda one: one.objects)
+            if found is None:
+                raise TapError('goal/objects: nothing came')
         except CallError as error:
             if 'click on an object' in str(error):
                 tries += 1

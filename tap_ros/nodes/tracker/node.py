@@ -155,7 +155,7 @@ class TrackerNode(Node):
     def _on_select(self, request: SelectObjects.Request,
                    response: SelectObjects.Response) -> SelectObjects.Response:
         with self._lock:
-            moment, view = self._newest()
+            moment, view = self._newest(to_nanoseconds(request.stamp))
             plane, camera = self._calibration(view.image.shape[:2])
             if request.propose:
                 tracked = self._propose(view, camera)
@@ -234,15 +234,20 @@ class TrackerNode(Node):
 
     # What is known of a picture
 
-    def _newest(self) -> tuple[Moment, View]:
-        """Return the newest picture; TrackingError where there is none of this scene."""
+    def _newest(self, asked_ns: int) -> tuple[Moment, View]:
+        """
+        Return the newest picture.
+
+        :param asked_ns: stamp of the one that was clicked, or 0.
+        :raises TrackingError: where there is none of this scene, or none so new.
+        """
         moment = self._sensors.newest(*self._topics)
         if moment is None:
             missing = self._sensors.missing(self._topics)
             raise TrackingError(
                 f'nothing has come on {self._sensors.names(missing, explained=True)}' if missing
                 else f'no messages of the same stamp on {self._sensors.names(self._topics)}')
-        if moment.stamp_ns < self._scene_ns():
+        if moment.stamp_ns < max(asked_ns, self._scene_ns()):
             raise TrackingError('no picture of the new episode has come yet; click again')
         return moment, self._view(moment)
 
