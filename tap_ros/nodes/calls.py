@@ -138,7 +138,8 @@ class Reaching:
     """
     A goal that the planner pursues; iterate over it for feedback until it ends.
 
-    A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px) and planning_ms.
+    A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px), planning_ms and
+    plan_samples.
 
     :param action_client: rclpy ActionClient of a node that another thread spins.
     :param goal: the action's goal.

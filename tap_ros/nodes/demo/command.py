@@ -129,7 +129,6 @@ def run(args: Options) -> int:
     :return: exit code.
     """
     args.check()
-    os.environ.setdefault('OMP_NUM_THREADS', '1')  # of the nodes, which share the cores
     folder = new_folder(args.out)
     print(f'starting nodes; their logs are in {folder / "logs"}', flush=True)
     begin, scenes = time.monotonic(), list[Scene]()
