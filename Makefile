@@ -19,9 +19,6 @@ SOURCES := package.xml setup.py setup.cfg tap_ros/contract.py resource/tap_ros $
 # An environment that was copied or moved here from elsewhere names the old place everywhere.
 $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 
-# Two processes share two cores best when each takes one.
-paper worlds: export OMP_NUM_THREADS ?= 1
-
 .PHONY: help demo explore test test-all paper worlds faults build lint bench ros2 clean
 
 help:

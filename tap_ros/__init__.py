@@ -11,6 +11,8 @@ import os
 import signal
 import sys
 
+from tap_ros.contract import NODE_CLASSES
+
 
 def leave_at_once(*_: object) -> None:
     """Say so and end: the handler of SIGINT while a command or a node is imported."""
@@ -22,14 +24,20 @@ def leave_at_once(*_: object) -> None:
 # themselves as soon as they run.
 if sys.argv[:1] == ['-m']:
     _program = sys.orig_argv[sys.orig_argv.index('-m') + 1] if '-m' in sys.orig_argv else ''
-    _ours = _program.partition('.')[0] in ('tap_ros', 'sim_bridge')
+    _ours = _program.partition('.')[0] in ('tap_ros', 'sim_bridge', 'experiments')
 else:
-    _ours = os.path.basename(os.path.dirname(sys.argv[0])) == 'tap_ros'  # lib/tap_ros/sim_node
+    _ours = os.path.basename(sys.argv[0]) in NODE_CLASSES  # lib/tap_ros/sim_node
 if _ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, leave_at_once)
 
-# By default an idle thread of libgomp spins for milliseconds before it sleeps. On cores that are
-# busy with something else that makes small networks 10 times slower; a fifth of it costs nothing.
+# Nodes, commands and their workers compute with one thread each, unless the user chose: threads
+# that wait for one another at every operator are many times slower on cores that are busy with
+# something else (docs/speed.md). The planner shares out whole batches instead. Set before torch
+# and OpenCV are imported; processes that are started from here inherit it.
+if _ours:
+    for _variable in ('OMP_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM'):
+        os.environ.setdefault(_variable, '1')
+# More threads, where they are chosen, spin for a fifth of the usual time before they sleep.
 if 'OMP_WAIT_POLICY' not in os.environ:
     os.environ.setdefault('GOMP_SPINCOUNT', '60000')
 

@@ -8,7 +8,6 @@ matters little.
 """
 
 from dataclasses import dataclass, replace
-import os
 import tempfile
 import time
 from typing import Annotated
@@ -78,7 +77,8 @@ def run(args):
 def measure(args):
     """Return the rows of this benchmark, which it prints."""
     device = pick_device(args.device)
-    torch.set_num_threads(args.threads or len(os.sched_getaffinity(0)))
+    if args.threads:
+        torch.set_num_threads(args.threads)
     rows, efficiencies = [], []
     for row in (*LADDER, *map(method_fields, args.methods)):
         with tempfile.TemporaryDirectory() as folder:

@@ -15,7 +15,7 @@ from rclpy.timer import Timer
 from sim_bridge.ros.publishers import ScenePublishers
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
 from sim_bridge.world_protocol import ability, make_world, Observation, World
-from std_msgs.msg import Float64
+from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode
 from tap_msgs.srv import ResetScene, SetGoal, StepScene
@@ -28,7 +28,7 @@ from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.services import answering
 from tap_ros.nodes.subscriptions import steady_timer
-from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
+from tap_ros.nodes.topics import LATCHED, LOCK_STEP, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
 
@@ -79,6 +79,8 @@ class SimNode(Node):
             self, self._sim, self.params['observer'], self.params['objects'] == 'tracked')
         self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
         self._episode = self.create_publisher(Episode, 'episode', STREAM)
+        self._lock_step = self.create_publisher(Bool, LOCK_STEP, LATCHED)
+        self._lock_step.publish(Bool(data=self.params['lock_step']))
         # Subscribed before the twist, so that of two commands sent together it is taken first.
         subscriptions: list[tuple[Any, str, Callable[..., None], Any]] = [
             (Float64, 'gripper/command', self._on_gripper, STREAM),

@@ -140,7 +140,8 @@ class Reaching:
     """
     A goal that the planner pursues; iterate over it for feedback until it ends.
 
-    A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px) and planning_ms.
+    A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px), planning_ms and
+    plan_samples.
     Leaving the iteration, or dropping this object, cancels nothing: its client still owns the
     goal, and cancels it when it is closed. A wait that fails or is interrupted cancels it.
 

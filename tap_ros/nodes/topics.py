@@ -20,6 +20,8 @@ STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE,
 # With the default depth of 10, DDS drops what comes beyond without a word.
 SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
+LOCK_STEP = 'sim/lock_step'  # latched: whether simulated time passes with commands alone
+
 
 def of_topic(topic: Topic) -> tuple[type, str]:
     """Return message class and name of a topic, as subscriptions take them."""

@@ -72,6 +72,7 @@ class Problem:
     """
     What a solver minimises.
 
+    :param cost: Judge; it raises where time is over, and the planner takes the best so far.
     :param mean: (D,) of the first Gaussian; std: (D,).
     :param clip: limits samples (N, D) to what is allowed.
     :param proposals: (P, D), samples that are worth a look.

@@ -30,6 +30,8 @@ from tap_ros.tracking.protocols import LOST, UNSURE
 
 MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
 MOST_UNSURE = 3  # pictures in a row in which an object is not known for sure; likewise
+MOST_LATE = 3  # plans in a row that took too long to be acted upon; likewise
+SENDING = 0.1  # share of max_age that is left for sending a command
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,9 @@ class Seen:
     names: tuple[str, ...]  # K object names
     pixels: np.ndarray  # (K, 2) (u, v), in the order of the names; the last ones of the hidden
     stamp_ns: int  # of the picture
-    received: float = 0.0  # s, on the clock of `now`: when the oldest part of it was received
+    # s, on the clock of `now`: when the oldest part of it was received; inf: it does not age, as
+    # where time stands until the next command
+    received: float = 0.0
     scene_ns: int = 0  # stamp at which the newest scene known of began; 0: nothing is known
     jumps: int = 0  # how often the clock of the stamps has jumped so far
     states: tuple[str, ...] = ()  # K of tracking.protocols.STATES; none: all are seen
@@ -56,7 +60,8 @@ class ReachConfig:
     :param switch: when to go on from a subgoal, see hierarchy.Itinerary.
     :param reached: px, mean distance of the objects; nearer than this is there. 0: never.
     :param limits: action_sequences.Limits of the actions.
-    :param max_age: s; nothing is planned from what was received longer ago.
+    :param max_age: s; nothing is planned from what was received longer ago. Plans end in time
+        for their command to be younger.
     :param timeout: s without a command, planning apart, after which the goal ends.
     :param rounds: how often to ask where to go, at least 1: again when the subgoals of a round are
         passed and a command was sent since it began, and not after the last round.
@@ -144,6 +149,7 @@ class Reach:
         self._before: tuple[_State, Command | None, float] | None = None
         self._next: _State | None = None
         self._refusal, self._refused = '', 0  # why the last command was refused; how many in a row
+        self._late = 0  # plans in a row
         self._sent_at = now  # of the last command, or when there was reason to wait
         self.steps, self.distance = 0, float('nan')
         self.pixels: np.ndarray | None = None
@@ -180,7 +186,16 @@ class Reach:
             return End('aborted', f'no command could be sent for {silence:.1f} s: {why}')
         if isinstance(answer, Command) and answer is not self._planned:
             self._planned = answer
-            self._sent_at += answer.plan.planning_ms / 1e3  # planning is no silence
+            took = answer.plan.planning_ms / 1e3
+            self._sent_at += took  # planning is no silence
+            age = now - seen.received if seen is not None else 0.0
+            self._late = self._late + 1 if age + took > self._config.max_age else 0
+            if self._late >= MOST_LATE:
+                return End('aborted', (
+                    f'{self._late} plans in a row came too late: the last took {took:.2f} s, with '
+                    f'{answer.plan.num_samples} samples, from what was {age:.2f} s old then, and '
+                    f'max_age is {self._config.max_age:g} s; raise max_age, take the preset quick '
+                    'or let this machine do less'))
         return answer
 
     def _answer(self, seen: Seen | None, now: float, lacking: str) -> Aim | Command | Wait | End:
@@ -193,7 +208,10 @@ class Reach:
         if self._planned is not None and self._planned.seen.stamp_ns == seen.stamp_ns:
             return self._planned
         self._first = self._first or seen
-        return Aim(seen) if self._state is None else self._plan(seen, self._state)
+        if self._state is None:
+            return Aim(seen)
+        return self._plan(
+            seen, self._state, seen.received + (1 - SENDING) * self._config.max_age - now)
 
     def interrupted(self, seen: Seen | None) -> End | None:
         """
@@ -294,8 +312,8 @@ class Reach:
             return f'what was seen is {age:.1f} s old' + (f': {lacking}' if lacking else '')
         return ''
 
-    def _plan(self, seen: Seen, state: _State) -> Aim | Command | End:
-        """Plan the next command from a new picture."""
+    def _plan(self, seen: Seen, state: _State, seconds: float) -> Aim | Command | End:
+        """Plan the next command from a new picture within so many seconds."""
         config, itinerary = self._config, state.itinerary
         self._next = state
         self.pixels = pixels = seen.pixels
@@ -317,7 +335,7 @@ class Reach:
         limit = np.array(seen.image.shape[1::-1]) - 1
         goal = self._goal(itinerary.targets[stage], np.clip(pixels, 0, limit))
         plan = self._mpc.plan(
-            Scene(seen.image, seen.gripper, pixels), goal, state.memory, config.limits)
+            Scene(seen.image, seen.gripper, pixels), goal, state.memory, config.limits, seconds)
         self._next = replace(state, memory=plan.memory)
         return Command(plan, len(state.switches), seen)
 

@@ -15,8 +15,9 @@ carry the maps, take the one that brings them closest to their goals, execute it
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+import math
 import os
 from pathlib import Path
 import time
@@ -44,6 +45,7 @@ from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import check_scene, Goal, Scene, tabulate
 from tap_ros.planning.protocols import ForwardModel, Problem, Solution, Solver
 from tap_ros.plugins import load_plugin
+from tap_ros.search import finite
 import torch
 
 WARM_STD = 0.5  # share of the first deviation that a search around the last plan begins with
@@ -108,6 +110,7 @@ class Plan:
     elites: np.ndarray  # (E, HORIZON, 4) the best ones that were considered
     places: np.ndarray  # (K, 2) m, of the table cells nearest to the goals
     cost: float  # what the search minimised: px, summed over objects and time
+    num_samples: int  # that the search judged
     memory: Memory  # for the next plan
 
 
@@ -149,22 +152,24 @@ class VisualMPC:
         """Return (height, width) of the pictures it takes."""
         return self.model.table.image_size
 
-    @torch.inference_mode()
     def goal(self, pixels: ArrayLike | None = None, maps: ArrayLike | None = None) -> Goal:
         """Tabulate a goal, given as pixels (K, 2) or as maps (K, H, W), see tabulate."""
-        return tabulate(self.model.table, pixels, maps)
+        return self.rollouts.compute(tabulate, self.model.table, pixels, maps)
 
     @torch.inference_mode()
     def plan(self, scene: Scene, goal: Goal, memory: Memory = Memory(),
-             limits: Limits = FULL) -> Plan:
+             limits: Limits = FULL, seconds: float = math.inf) -> Plan:
         """
         Choose the next action.
 
         :param memory: of the plan before.
         :param limits: of the actions.
+        :param seconds: that it may take. The search then ends early, with the best so far; at
+            least as many samples are judged as are at once.
         :raises PlanningError: for a scene that cannot be planned in.
         """
-        begin, scene = time.perf_counter(), check_scene(scene, self.image_size)
+        limit, begin = TimeLimit(seconds), time.perf_counter()
+        scene = check_scene(scene, self.image_size)
         if len(goal) != len(scene.object_pixels):
             raise PlanningError(f'goal: {len(goal)} goals for {len(scene.object_pixels)} objects; '
                                 'give one for each object, in the same order')
@@ -172,39 +177,53 @@ class VisualMPC:
         table, gripper = self.model.table, scene.gripper
         maps = table.seed_maps(torch.from_numpy(scene.object_pixels).to(table.device))
         weights, = to_numpy(maps.flatten(1))
-        start = self.model.begin(
-            to_float(scene.image)[None].to(table.device),
-            torch.from_numpy(gripper)[None].to(table.device), self.config.arm_hidden)
+        start = Start(maps, self.rollouts.compute(
+            self.model.begin, to_float(scene.image)[None].to(table.device),
+            torch.from_numpy(gripper)[None].to(table.device), self.config.arm_hidden))
         # search the sequence of least cost
-        shape, judge = SequenceShape(limits), partial(self.rollouts.judge, start, maps)
-        here = weights @ self._points
+        shape, here = SequenceShape(limits), weights @ self._points
         blocked = memory.blocked_now(scene, here)
-        found = self._search(shape, judge, gripper, here, goal, replace(memory, blocked=blocked))
+        found, num_samples = self._search(
+            shape, replace(start, limit=limit), gripper, here, goal,
+            replace(memory, blocked=blocked))
         # say where it ends; its first action is the answer
         parameters = np.concatenate([found.best[None], found.elites])
         actions, *elites = shape.actions(parameters, gripper[2])
-        _, (end,) = judge(goal.distances, actions[None], gripper[None], HORIZON)
+        _, (end,) = self.rollouts.judge(
+            start, goal.distances, actions[None], gripper[None], HORIZON)
         milliseconds = 1000 * (time.perf_counter() - begin)
         left, *kept = map(shift, parameters)
         return Plan(actions[0], float(end), milliseconds, actions,
-                    np.array(elites), goal.places, found.cost,
+                    np.array(elites), goal.places, found.cost, num_samples,
                     Memory(memory.seed, memory.count + 1, left, np.array(kept),
                            (float(gripper[2]), float(gripper[2] + actions[0, 2])), blocked))
 
-    def _search(self, shape: SequenceShape, judge: Callable[..., tuple[np.ndarray, np.ndarray]],
-                gripper: np.ndarray, here: np.ndarray, goal: Goal,
-                memory: Memory) -> Solution:
-        """Search the parameters of least cost; here: (K, 2) m, where the objects are."""
+    def _search(self, shape: SequenceShape, start: 'Start', gripper: np.ndarray,
+                here: np.ndarray, goal: Goal, memory: Memory) -> tuple[Solution, int]:
+        """
+        Search the parameters of least cost; return how many were judged, too.
+
+        :param here: (K, 2) m, where the objects are.
+        """
         config, prices = self.config, self.cost.prices(goal.distances)
+        judged: list[tuple[np.ndarray, np.ndarray]] = []  # samples, costs
         blocked = np.array([one.place for one in memory.blocked]).reshape(-1, 2)
 
         # mean over where the gripper begins
         def cost(samples: np.ndarray, grippers: np.ndarray = gripper[None]) -> np.ndarray:
             actions = shape.actions(samples, gripper[2])
             clash = self.cost.of_landings(landings(actions, gripper), here, blocked)
-            costs, _ = judge(prices, actions.repeat(len(grippers), 0),
-                             np.tile(grippers, (len(samples), 1)), config.cost_every)
+            costs, _ = self.rollouts.judge(
+                start, prices, actions.repeat(len(grippers), 0),
+                np.tile(grippers, (len(samples), 1)), config.cost_every)
             return costs.reshape(len(samples), -1).mean(1) + clash
+
+        # a solver need not know of time: its search is left, with what it has tried
+        def cost_in_time(samples: np.ndarray) -> np.ndarray:
+            judged.append((samples, cost(samples)))
+            if start.limit.over:
+                raise TimeIsOver
+            return judged[-1][1]
 
         # from here and from a little beside
         def recheck(samples: np.ndarray) -> np.ndarray:
@@ -220,10 +239,53 @@ class VisualMPC:
         if config.warm_start and memory.parameters is not None:
             mean, std = memory.parameters, WARM_STD * std
             proposals = np.concatenate([proposals, mean[None]])
-        return self.solver(
-            Problem(cost, mean, std, partial(shape.clip, least_lift=shape.least_lift(gripper[2])),
-                    proposals, memory.elites if config.warm_start else None, MOVES,
-                    recheck if config.recheck else None), config.search, rng)
+        problem = Problem(
+            cost_in_time, mean, std,
+            partial(shape.clip, least_lift=shape.least_lift(gripper[2])), proposals,
+            memory.elites if config.warm_start else None, MOVES,
+            recheck if config.recheck else None)
+        try:
+            solution = self.solver(problem, config.search, rng)
+        except TimeIsOver:
+            samples, costs = map(np.concatenate, zip(*judged))
+            first = np.argsort(finite(costs), kind='stable')[:config.search.num_elites]
+            solution = Solution(samples[first[0]], float(costs[first[0]]), samples[first])
+        return solution, sum(int((~np.isnan(costs)).sum()) for _, costs in judged)
+
+
+class TimeIsOver(Exception):
+    """Ends the search of a solver."""
+
+
+class TimeLimit:
+    """
+    Lets the parts of a search begin that will end in time, judged by the longest so far.
+
+    :param seconds: from now on.
+    :ivar over: whether a part was left out.
+    """
+
+    def __init__(self, seconds: float = math.inf) -> None:
+        self._end, self._longest, self.over = time.perf_counter() + seconds, -math.inf, False
+
+    def run(self, part: Callable[[], Any]) -> Any:
+        """Return what a part returns, None if it is left out; those are run that begin at once."""
+        begin = time.perf_counter()
+        if self.over or begin + self._longest > self._end:
+            self.over = True
+            return None
+        found = part()
+        self._longest = max(self._longest, time.perf_counter() - begin)
+        return found
+
+
+@dataclass(frozen=True)
+class Start:
+    """What all sequences of a plan begin with."""
+
+    maps: torch.Tensor  # (K, n, n) of the objects now
+    features: Any  # from ForwardModel.begin
+    limit: TimeLimit = field(default_factory=TimeLimit)
 
 
 class Rollouts:
@@ -232,7 +294,8 @@ class Rollouts:
 
     :param model: ForwardModel; cost: PlanCost.
     :param batch_size: sequences predicted at once, at most.
-    :param threads: on the CPU; 0: as many as there are cores.
+    :param threads: on the CPU; 0: as many as there are cores. Each computes alone: so the bits
+        of a plan do not depend on how many threads torch is given.
     """
 
     def __init__(self, model: ForwardModel, cost: PlanCost, batch_size: int,
@@ -244,12 +307,16 @@ class Rollouts:
             (threads or len(os.sched_getaffinity(0))) if model.table.device.type == 'cpu' else 1,
             initializer=torch.set_num_threads, initargs=(1,))
 
-    def judge(self, start: Any, maps: torch.Tensor, prices: torch.Tensor, actions: np.ndarray,
+    def compute(self, function: Callable[..., Any], *args: Any) -> Any:
+        """Return what a function of tensors returns, computed in one of the threads."""
+        return self._pool.submit(torch.inference_mode()(function), *args).result()
+
+    def judge(self, start: Start, prices: torch.Tensor, actions: np.ndarray,
               grippers: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
         """
         Judge action sequences by PlanCost.of_maps.
 
-        :param start: from ForwardModel.begin; maps (K, n, n) of the objects now.
+        :param start: Start; what its limit leaves out is NaN.
         :param prices: (K, n n) px, of an object in each table cell.
         :param actions: numpy (N, HORIZON, 4); grippers (N, 4), where each sequence begins.
         :param every: look at the maps after every so many steps.
@@ -263,17 +330,23 @@ class Rollouts:
             count = len(actions)  # the last part is filled up: all go the same way
             actions, grippers = (torch.cat([t, t[-1:].expand(size - count, *t.shape[1:])])
                                  for t in (actions, grippers))
-            carried = self.model.carried_maps(start, grippers, maps, actions, every)
+            carried = self.model.carried_maps(
+                start.features, grippers, start.maps, actions, every)
             costs, ends = self.cost.of_maps(carried, prices)
             return costs[:count], ends[:count]
 
         # together with others that come down as late: up there, nothing needs to be predicted
         heights = grippers[:, 2:3] + actions[..., 2].cumsum(1)
         order = np.argsort((heights > LOW + 0.01).sum(1), kind='stable')
-        parts = [torch.from_numpy(values[order]).to(prices.device).split(size)
-                 for values in (actions, grippers)]
-        costs, ends = to_numpy(*map(torch.cat, zip(*self._pool.map(judge, *parts))))
         back = np.argsort(order)
+        parts = list(zip(*(torch.from_numpy(values[order]).to(prices.device).split(size)
+                           for values in (actions, grippers))))
+        # the part of the last sequence first: solvers put proposals there, such as the last plan
+        queue = sorted(range(len(parts)), key=lambda i: i != back[-1] // size)
+        running = {i: self._pool.submit(start.limit.run, partial(judge, *parts[i])) for i in queue}
+        found = [running[i].result() or prices.new_full((2, len(part[0])), torch.nan).unbind()
+                 for i, part in enumerate(parts)]
+        costs, ends = to_numpy(*map(torch.cat, zip(*found)))
         # rounded so that the batch size, which moves the last bits, cannot change the ranking
         return costs[back].astype(np.float64).round(2), ends[back]
 

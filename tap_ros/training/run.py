@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 import hashlib
 import json
-import os
 from pathlib import Path
 import platform
 import signal
@@ -148,7 +147,8 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
         stays; the run goes on from there.
     """
     device = pick_device(config.device)
-    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    if config.threads:
+        torch.set_num_threads(config.threads)
     reading = reading_of(config)
     paths = paths_of(config)
     check_first_picture(paths, reading, f'the {kind.replace("_", " ")}')

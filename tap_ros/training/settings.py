@@ -34,7 +34,8 @@ class RunSettings:
     :param held_out: recordings that are held out instead, among those to train on or beside them.
     :param seed: of the weights, batches and augmentation.
     :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
-    :param threads: of the CPU; 0: as many as there are.
+    :param threads: of the CPU; 0: what OMP_NUM_THREADS says, or one. More are faster on cores that
+        nothing else uses, and many times slower on others.
     :param log_every: steps between curve points.
     :param save_every: steps between checkpoints, scores and sample pictures.
     """

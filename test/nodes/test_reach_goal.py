@@ -18,11 +18,14 @@ import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from tap_msgs.action import ReachGoal
+import tap_ros
 from tap_ros.messages.images import decode_image
 from tap_ros.nodes.calls import CallError
+from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.planner.plan_view import CHOSEN
 from tap_ros.nodes.reaching import Reaching, watch_sender
 from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.planning.mpc_config import PRESETS
 from tap_ros.training.weights import save_weights, stored_digest
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
@@ -49,6 +52,32 @@ def aborted(loop, *words, **fields):
     assert result.end == 'aborted' and not result.success and result.steps == 0
     assert all(word in result.message for word in words), result.message
     assert loop.stopped() and len(loop.moves()) == count
+
+
+# Time
+
+
+@pytest.mark.parametrize('lock_step', [False, True])
+def test_plans_end_in_time_or_the_goal_does_unless_the_simulator_waits(tmp_path, lock_step):
+    namespace, search = f'/hurry_{lock_step}', PRESETS['large'].search
+    with NodeProcesses(tmp_path, namespace) as nodes, tap_ros.Client(namespace) as client:
+        nodes.start('sim_node', lock_step=lock_step)
+        nodes.start('visual_mpc_node', max_age=0.1, preset='large', image_timeout=60.0,
+                    max_silence=5.0)
+        nodes.wait_until_ready()
+        client.wait_until_ready('sim_node', 'visual_mpc_node')
+        client.reset(seed=3)
+        told = []
+        result = client.reach(
+            mode='direct', step_budget=2, timeout_s=120, on_feedback=told.append).result()
+    samples = [feedback.plan_samples for feedback in told]
+    if lock_step:
+        assert (result.end, result.steps) == ('succeeded', 2), result.message
+        assert samples == [search.num_samples * search.num_iterations] * 2
+    else:
+        assert all(0 < count < search.num_samples * search.num_iterations for count in samples)
+        assert result.steps == 2 or re.search(
+            r'took \d.* and max_age is 0.1 s', result.message), result.message
 
 
 # The same acts as in one process

@@ -14,6 +14,7 @@ from tap_ros.planning.reach import (
     Aim,
     Command,
     End,
+    MOST_LATE,
     MOST_REFUSED,
     Reach,
     ReachConfig,
@@ -121,6 +122,28 @@ def test_pictures_alone_do_not_keep_a_goal_alive(mpc, monkeypatch):
     assert answer.outcome == 'aborted' and 5 + 0.25 * (t - 1) < t < 7 + 0.25 * t
 
 
+def test_plans_that_come_too_late_end_the_goal_naming_both_times(mpc, monkeypatch):
+    plan, limits = mpc.plan, []
+
+    def slow(*given):
+        limits.append(given[-1])
+        late = len(limits) != 2  # one in time begins the count anew
+        return replace(plan(*given), planning_ms=4500.0 if late else 100.0, num_samples=7)
+
+    monkeypatch.setattr(mpc, 'plan', slow)
+    reach = begun(mpc)
+    for t in range(1, 4 + MOST_LATE):
+        answer = reach.step(look(t), t + 1.0)  # what is seen is 1 s old
+        if isinstance(answer, End):
+            break
+    assert answer.outcome == 'aborted' and t == 2 + MOST_LATE and limits == [3.5] * t
+    assert all(word in answer.message for word in ('4.50 s', '1.00 s', '7 samples', 'is 5 s'))
+    reach = begun(mpc)
+    for t in range(1, 4 + MOST_LATE):  # what does not age may be planned from for ever
+        assert isinstance(reach.step(look(t, received=np.inf), t + 1.0), Command)
+    assert limits[-1] == np.inf
+
+
 def test_an_arm_that_refuses_all_ends_the_goal_and_one_that_carries_out_some_does_not(mpc):
     for carries_out, ends in ((lambda t: False, True), (lambda t: t % MOST_REFUSED == 0, False)):
         reach = begun(mpc, ReachConfig(20))
@@ -202,9 +225,9 @@ def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
 def test_a_later_round_knows_where_the_gripper_met_something(mpc, monkeypatch):
     plan, known = mpc.plan, []
 
-    def plan_down(scene, goal, memory, limits):
+    def plan_down(scene, goal, memory, limits, seconds):
         known.append(memory.blocked)
-        made = plan(scene, goal, memory, limits)
+        made = plan(scene, goal, memory, limits, seconds)
         return replace(made, memory=replace(made.memory, heights=(0.13, 0.012)))
 
     monkeypatch.setattr(mpc, 'plan', plan_down)

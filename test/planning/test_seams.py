@@ -3,6 +3,8 @@
 """A solver, a forward model and a cost of one's own drive the planner and the control loop."""
 
 from importlib.metadata import EntryPoint
+from math import inf
+import time
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.planning.cost import PlanCost
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig, Seen
 from toy_world import SCALE, SIZE, Telekinesis
@@ -52,6 +55,34 @@ def test_a_goal_is_reached_with_any_forward_model_and_solver(solver):
     config = VisualMPCConfig(solver=solver, clearance=0.0, recheck=0, threads=1)
     end, steps = reach(VisualMPC(Telekinesis(), config))
     assert end.outcome == 'reached' and 5 <= steps < 60
+
+
+def forgetful(problem: Problem, config: SearchConfig, rng: np.random.Generator) -> Solution:
+    """Return the best of the last iteration."""
+    best_of_some(problem, config, rng)
+    return best_of_some(problem, config, rng)
+
+
+@pytest.mark.parametrize('solver', [forgetful, 'cem', 'icem'])
+def test_a_plan_ends_in_time_with_the_best_so_far_whatever_the_solver(solver):
+    class Slow(Telekinesis):
+        def carried_maps(self, *given):
+            sizes.append(len(given[3]))
+            time.sleep(0.05)
+            return super().carried_maps(*given)
+
+    scene = Scene(np.zeros((SIZE, SIZE, 3), np.uint8), np.zeros(4, np.float32), START)
+    mpc = VisualMPC(Slow(), VisualMPCConfig(solver=solver, batch_size=8, threads=1))
+    found, plans = [], []
+    for seconds in (inf, 1e6, 0.12, 0.0):  # the last: one part at least
+        sizes = []
+        plans.append(mpc.plan(scene, mpc.goal(GOAL), seconds=seconds))
+        assert np.isfinite(plans[-1].cost) and len(plans[-1].elites)
+        found.append(plans[-1].num_samples)
+        assert seconds > 1 or sum(sizes[:-1]) == found[-1]
+    assert found[0] == found[1] >= 64 > found[2] >= found[3] == sizes[0] > 0
+    np.testing.assert_array_equal(plans[0].actions, plans[1].actions)
+    assert plans[0].cost <= plans[3].cost
 
 
 def test_a_cost_of_ones_own_is_minimised_with_the_same_model():

@@ -75,6 +75,15 @@ def test_batch_size_and_threads_change_nothing(model, trained):
         assert same(expected, plans(model, replace(SMALL, **changes)))
     assert same(*(plans(trained, replace(SMALL, batch_size=size), steps=1, scale=2)
                   for size in (12, 9)))
+    costs, threads = [], torch.get_num_threads()
+    try:
+        for number in (1, 2):  # of torch: not one bit
+            torch.set_num_threads(number)
+            plan, = plans(trained, steps=1, scale=2)
+            costs.append((plan.cost, plan.expected_distance))
+    finally:
+        torch.set_num_threads(threads)
+    assert costs[0] == costs[1]
 
 
 def test_a_goal_map_at_one_pixel_is_that_goal_pixel(model):

@@ -132,7 +132,6 @@ def run(args: Options) -> int:
     :raises TapError: when no scene could be finished.
     """
     args.check()
-    os.environ.setdefault('OMP_NUM_THREADS', '1')  # of the nodes, which share the cores
     folder = new_folder(args.out)
     print(f'starting nodes; their logs are in {folder / "logs"}', flush=True)
     begin, scenes, left_out = time.monotonic(), list[Scene](), dict[str, str]()

@@ -244,4 +244,4 @@ class ExplorerCalls:
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
         self._stage = (f'step {feedback.step}, to the {escaped(feedback.stage, 60)}, plan in '
-                      f'{feedback.planning_ms:.0f} ms')
+                      f'{feedback.planning_ms:.0f} ms with {feedback.plan_samples} samples')

@@ -347,7 +347,7 @@ class VisualMpcNode(LifecycleBase):
         handle.publish_feedback(ReachGoal.Feedback(
             step=reach.steps, stage=stage_name(command.stage, len(reach.targets) - 1),
             expected_distance=float(plan.expected_distance),
-            planning_ms=float(plan.planning_ms)))
+            planning_ms=float(plan.planning_ms), plan_samples=plan.num_samples))
 
     def _is_cancelled(self, handle: ServerGoalHandle) -> bool:
         return self._cancelled is handle or handle.is_cancel_requested

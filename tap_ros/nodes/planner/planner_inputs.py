@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
 from tap_msgs.msg import Episode, ObjectStates
 from tap_ros.errors import ImageError, KinematicsError, PlanningError, TapError
 from tap_ros.images.crop import TrainedCrop
@@ -25,7 +26,7 @@ from tap_ros.nodes.observations import JUMP_NS, Observations, reception_time
 from tap_ros.nodes.parameters import declared_arm, Parameters
 from tap_ros.nodes.robot_view import RobotView
 from tap_ros.nodes.subscriptions import publishers_of, rivals
-from tap_ros.nodes.topics import camera_topics, of_topic, STREAM
+from tap_ros.nodes.topics import camera_topics, LATCHED, LOCK_STEP, of_topic, STREAM
 from tap_ros.planning.reach import Seen
 
 
@@ -66,6 +67,8 @@ class PlannerInputs:
         self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
                                others={'joints': self._on_joints})
         node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
+        self._told_lock_step = False
+        self._simulator = node.create_subscription(Bool, LOCK_STEP, self._on_lock_step, LATCHED)
 
     def begin(self, since: float) -> None:
         """Begin a goal: only what is received from this monotonic time on is seen."""
@@ -93,7 +96,8 @@ class PlannerInputs:
                 f'no messages of the same stamp on {self.sensors.names(topics)} since the goal '
                 'was accepted')
         times: dict[str, Any] = {
-            'received': moment.received, 'scene_ns': self._scene_ns(moment.stamp_ns),
+            'received': math.inf if self._lock_step else moment.received,
+            'scene_ns': self._scene_ns(moment.stamp_ns),
             'jumps': self.sensors.jumps}
         if self._seen is not None and (self._seen.stamp_ns, self._seen.jumps) == (
                 moment.stamp_ns, times['jumps']):
@@ -102,6 +106,11 @@ class PlannerInputs:
             self._seen = self._decode(moment.messages, moment.stamp_ns, times)
             self.frame_id = moment.messages['image'].header.frame_id
         return self._seen, lacking
+
+    @property
+    def _lock_step(self) -> bool:
+        """Tell whether the simulator waits for commands, so that what is seen does not age."""
+        return self._told_lock_step and self._simulator.get_publisher_count() > 0
 
     def newest_stamp(self) -> int:
         """Return the stamp of the newest picture that has come with its joints, in ns."""
@@ -222,6 +231,9 @@ class PlannerInputs:
         what = 'nothing' if missing else 'nothing new'
         return (f'{what} has come on {self.sensors.names(silent, explained=True)}'
                 if silent else '')
+
+    def _on_lock_step(self, message: Bool) -> None:
+        self._told_lock_step = message.data
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:

@@ -82,8 +82,9 @@ def declare_parameters(node: Node) -> Parameters:
                        'Seconds that a command is valid after it came; told to the arm on '
                        'arm/command_timeout.', low=0.01, high=60.0)
     parameters.declare('max_age', 3.0,
-                       'Seconds; what was received longer ago is not acted upon, so a plan that '
-                       'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
+                       'Seconds; what was received longer ago is not acted upon. A plan ends in '
+                       'time for that, if need be with fewer samples; in lock-step nothing ages.',
+                       low=0.1, high=600.0, read_only=False)
     parameters.declare_arm()
     parameters.declare('image_timeout', 5.0,
                        'Seconds without a usable observation after which a goal is aborted.',
