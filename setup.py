@@ -54,8 +54,9 @@ setup(
     install_requires=REQUIRED if 'setuptools.build_meta' in sys.modules else ['setuptools'],
     extras_require={  # what only some commands need; `colcon test` runs pytest because of the last
         'tfrecord': ['google-crc32c', 'protobuf'],
+        'arrays': ['h5py'],
         'explorer': ['websockets'],
-        'lerobot': ['pyarrow'],
+        'lerobot': ['pyarrow>=14.0.1'],  # those before run code that is in a file
         'ray': ['ray'],
         'test': ['pytest'],
     },

@@ -33,7 +33,7 @@ Run: TypeAlias = Callable[[Any], int | None]
 COMMANDS: dict[str, tuple[str, Module]] = {
     'collect': ('simulate the expert and record it', 'sim_bridge.collect'),
     'import-video': ('import video files', 'tap_ros.recording.formats.pictures'),
-    'import-arrays': ('import pictures of HDF5 files or zarr stores',
+    'import-arrays': ('import pictures of HDF5 files',
                       'tap_ros.recording.formats.arrays'),
     'import-tfrecord': ('import TFRecord files: RLDS data sets, BAIR',
                         'tap_ros.recording.formats.tfrecord'),
@@ -81,7 +81,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
 }
 EXTRAS = {  # what only some commands need, and what pip calls it
     'google': 'google-crc32c protobuf', 'google_crc32c': 'google-crc32c protobuf',
-    'pandas': 'pandas', 'pyarrow': 'pyarrow', 'ray': 'ray',
+    'h5py': 'h5py', 'pandas': 'pandas', 'pyarrow': 'pyarrow', 'ray': 'ray',
     'websockets': 'websockets'}
 PROG = 'python -m tap_ros'
 

@@ -15,7 +15,7 @@ from tap_ros.images.crop import CENTRE, check_trainable, TrainedCrop
 from tap_ros.recording.columns import Columns, first_size
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.foreign import open_file, recognise
-from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number
+from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number, natural
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.topic_choice import find_topics, list_paths
 from tap_ros.text import escaped
@@ -39,7 +39,8 @@ def find_bags(path: str | Path) -> list[list[Path]]:
             raise RecordingError(
                 f'{path}: there is no such file or folder' if not path.exists() else
                 f'{path}: neither a regular file nor a folder')
-        folders = [path] if _is_bag(path) else sorted(f for f in path.iterdir() if _is_bag(f))
+        folders = [path] if _is_bag(path) else sorted(
+            filter(_is_bag, path.iterdir()), key=natural)
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     bags = [files for folder in folders if (files := bag_files(folder))]

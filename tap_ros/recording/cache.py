@@ -178,8 +178,8 @@ def _jobs(bags: Sequence[Sequence[Path]], found: Sequence[Mapping[str, str]], re
     def job(path: Path, names: Mapping[str, str]) -> _Job:
         with open(path, 'rb') as stream:
             digest = hashlib.file_digest(stream, 'sha256')
-        with suppress(FileNotFoundError):  # of a recorder that was killed
-            digest.update(path.with_name(f'{path.name}-wal').read_bytes())
+        if (log := path.with_name(f'{path.name}-wal')).is_file():  # of a recorder that was killed
+            digest.update(log.read_bytes())
         key = hashlib.sha256(json.dumps([
             FORMAT, sorted(names.items()), reading.crop, reading.size, reading.rate,
         ]).encode()).hexdigest()[:8]

@@ -10,6 +10,7 @@ import shlex
 import stat
 
 from tap_ros.errors import RecordingError
+from tap_ros.recording.trust import Budget
 from tap_ros.text import escaped
 import zstandard
 
@@ -34,15 +35,20 @@ def bytes_of(path: str | Path) -> bytes | mmap.mmap:
             start = stream.read(4)
             if start == zstandard.FRAME_HEADER:
                 stream.seek(0)
-                data = zstandard.ZstdDecompressor().stream_reader(
-                    stream, read_across_frames=True).read()
+                pieces, budget = [], Budget(os.fstat(stream.fileno()).st_size)
+                reader = zstandard.ZstdDecompressor().stream_reader(
+                    stream, read_across_frames=True)
+                while piece := reader.read(2**20):
+                    budget.take(len(piece))
+                    pieces.append(piece)
+                data = b''.join(pieces)
                 if not data:
                     raise RecordingError(f'{path}: does not unpack: it is cut short')
             elif start:
                 data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
-    except (zstandard.ZstdError, MemoryError) as error:
+    except (ValueError, zstandard.ZstdError, MemoryError) as error:
         raise RecordingError(f'{escaped(path)}: does not unpack: {escaped(error)}; unpack it with '
                              'zstd -d') from error
     if not start:

@@ -6,7 +6,9 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import closing, suppress
 from itertools import islice
+import os
 from pathlib import Path
+import re
 import shlex
 import sqlite3
 
@@ -17,6 +19,7 @@ from tap_ros.recording.damage import FAR, Loss
 from tap_ros.recording.file_bytes import bytes_of, PACKED, unpacked_name
 from tap_ros.recording.mcap_file import Channel, Found, McapFile
 from tap_ros.recording.metadata import bag_files, FILE_NAME, natural
+from tap_ros.recording.trust import Budget
 from tap_ros.text import escaped, listing
 import zstandard
 
@@ -35,6 +38,7 @@ class SqliteFile(McapFile):
         self.losses: list[Loss] = []
         self._counts = Counter[int]()
         self._summary, self._is_read = Summary(), True  # the number of messages is known
+        self._budget = Budget(os.stat(path).st_size)
         self._newest: int | None = None
         try:
             with closing(self._open()) as base:
@@ -45,6 +49,11 @@ class SqliteFile(McapFile):
 
     def _describe(self, base: sqlite3.Connection) -> None:
         """Learn of the channels, and how many messages each has."""
+        for name, text in base.execute(  # a view or a formula may have no end
+                "SELECT name, sql FROM sqlite_master WHERE type IN ('table', 'view') "
+                "AND name IN ('topics', 'messages', 'message_definitions')"):
+            if not re.match(r'CREATE TABLE\b', text) or re.search(r'(?i)\bAS\b', text):
+                raise ValueError(f'{name} is no plain table')
         texts = dict[str, str]()
         with suppress(sqlite3.Error):  # bags before Iron have none
             texts = dict(base.execute(
@@ -53,6 +62,8 @@ class SqliteFile(McapFile):
         for number, topic, kind, encoding in base.execute(
                 'SELECT id, name, type, serialization_format FROM topics'):
             text = texts.get(kind, '')
+            if not all(isinstance(word, str) for word in (topic, kind, encoding, text)):
+                raise ValueError('topics holds what is no text')
             self.channels[number] = Channel(
                 topic, kind, encoding, 'ros2msg' if text else '', text)
         self._counts.update(dict(base.execute(
@@ -63,6 +74,9 @@ class SqliteFile(McapFile):
             with closing(self._open()) as base:
                 for number, log, data in base.execute(
                         'SELECT topic_id, timestamp, data FROM messages ORDER BY id'):
+                    if not isinstance(log, int) or not isinstance(data, bytes):
+                        self.losses.append(Loss('it holds no message', 'row', cuts=False))
+                        continue
                     self._newest = min(log, FAR)
                     yield [(number, log, log, memoryview(data))]
         except sqlite3.Error as error:
@@ -80,7 +94,7 @@ class SqliteFile(McapFile):
             base = sqlite3.connect(':memory:')
             base.deserialize(bytes_of(path))
             return base
-        way = 'mode=ro' if path.with_name(f'{path.name}-wal').exists() else 'immutable=1'
+        way = 'mode=ro' if path.with_name(f'{path.name}-wal').is_file() else 'immutable=1'
         return sqlite3.connect(f'{path.absolute().as_uri()}?{way}', uri=True)
 
 
@@ -97,12 +111,12 @@ def recognise(path: Path) -> list[list[Path]] | None:
     if path.suffix == '.mcap' or _start(path).startswith(MAGIC):
         return None
     if path.is_dir():
-        parts = sorted(part for part in path.iterdir() if part.is_dir())
+        parts = sorted((part for part in path.iterdir() if part.is_dir()), key=natural)
         if any(map(_bag, parts)):
             return [files for part in parts if (files := _bag(part) or bag_files(part))]
         if any(next(path.glob(names), None) for names in ('*.mcap*', '*/*.mcap*')):
             return None
-    if what := _what(path):
+    if what := what_is(path):
         raise RecordingError(f'{escaped(path)}: {what}')
     return None
 
@@ -146,14 +160,16 @@ def _bag(path: Path) -> list[Path] | None:
     return None
 
 
-def _what(path: Path) -> str:
+def what_is(path: Path) -> str:
     """Return what something is that is no bag, and the command that makes one; '' if unknown."""
     for folder in (path, *path.absolute().parents[:4]):
         if (folder / 'meta' / 'info.json').is_file():
             return _advice('LeRobot data', 'import-lerobot', folder)
     if path.name.endswith('.zarr.zip') or any((path / name).is_file() for name in (
             '.zgroup', '.zarray', '.zattrs', 'zarr.json')):
-        return _advice('a zarr store', 'import-arrays', path)
+        return ('a zarr store, which is not read, as it may hold code; most such sets are on '
+                "LeRobot's hub (hf download lerobot/pusht --repo-type dataset --local-dir pusht),"
+                ' for import-lerobot')
     for file in (path, *(islice(path.rglob('*'), _MOST_FILES) if path.is_dir() else ())):
         if '.tfrecord' in file.name:
             return _advice('TFRecord files, as of RLDS', 'import-tfrecord', path)

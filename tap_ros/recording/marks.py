@@ -25,14 +25,16 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import write_atomically
+from tap_ros.recording.trust import parse_json, read_bytes
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
 
 Mark = tuple[int, int]  # its first and its last frame
+_MOST_BYTES = 2**26  # of a file of marks
 
 
 @dataclass(frozen=True)
@@ -63,12 +65,16 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
     """
     name = escaped(path)
     try:
-        data = Path(path).read_bytes()
-        entries = json.loads(data)['marks']
+        data = read_bytes(path, _MOST_BYTES)
+        entries = parse_json(data)['marks']
         found = [(entry['recording'], entry['episode'], entry['stamps']) for entry in entries]
+        if not all(isinstance(one[0], str) and isinstance(one[1], int) for one in found):
+            raise TypeError
     except OSError as error:
         raise ConfigError(
             f'{name}: {error.strerror}; make it by `python -m tap_ros mark`') from error
+    except RecordingError as error:
+        raise ConfigError(str(error)) from error
     except (LookupError, TypeError, ValueError) as error:
         raise ConfigError(f'{name}: is no file of marks; expected {{"marks": [{{"recording": '
                           '"door", "episode": 0, "stamps": [13.25]}]}, with seconds') from error
@@ -79,7 +85,7 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
             if i in episodes:
                 raise ValueError('its episode is marked above; put all its stamps in one entry')
             episodes[i] = _frames(store[i].stamps, stamps)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError, RuntimeError, OSError) as error:
             raise ConfigError(f'{name}: mark {number} (recording {escaped(recording, 60)}, episode'
                               f' {escaped(episode, 20)}): {error}') from error
     return Marks(episodes, hashlib.sha256(data).hexdigest())

@@ -25,17 +25,22 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Chunk, ChunkIndex, DataEnd, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import breakup_chunk, StreamReader
+from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC as MAGIC
+from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import RecordingError
 from tap_ros.recording.damage import FAR, Loss
 from tap_ros.recording.file_bytes import bytes_of, what_else
+from tap_ros.recording.trust import Budget
 from tap_ros.text import escaped
 import zstandard
 
 MAX_CHUNK_BYTES = 2**28  # a chunk that claims to unpack to more is refused
+_MAX_MESSAGE_BYTES = MAX_PICTURE_BYTES + 2**16  # of one that rosbag2 compressed
+_MAX_SCHEMA_BYTES = 2**17  # that are kept of a definition; the longest in use have some thousands
 _RECORD = struct.Struct('<BQ')  # opcode, length of what follows
+_MESSAGE = struct.Struct('<HIQQ')  # channel, number, log and publish time; its data follow
 _FOOTER = struct.Struct('<BQQQI')  # opcode, length, summary start, summary offsets start, crc
 _DAMAGE = (McapError, struct.error, ValueError, OverflowError, RuntimeError, MemoryError,
            zstandard.ZstdError)  # of damaged bytes
@@ -66,6 +71,7 @@ class McapFile:
     def __init__(self, path: str | Path) -> None:
         self.path = path
         self._data = bytes_of(path)
+        self._budget = Budget(len(self._data))
         if self._data[:len(MAGIC)] != MAGIC:
             why = what_else(Path(path)) or (
                 f'not an MCAP file: it starts with {self._data[:8].hex(" ")}, not '
@@ -116,6 +122,12 @@ class McapFile:
             channel = self.channels.get(number)
             if channel is None or channel.topic not in wanted:
                 continue
+            if data[:4] == zstandard.FRAME_HEADER:  # rosbag2 compressed it
+                with suppress(*_DAMAGE):  # who decodes it says that it is none
+                    content = _unpack('zstd', data, _MAX_MESSAGE_BYTES + 1)
+                    self._budget.take(len(content))
+                    if len(content) <= _MAX_MESSAGE_BYTES:
+                        data = memoryview(content)
             yield channel, min(log, FAR), min(publish, FAR), data
         self._conclude(wanted)
         self._is_read = True
@@ -146,7 +158,8 @@ class McapFile:
                 crc and zlib.crc32(self._data[start:-len(MAGIC) - 4]) != crc):
             return summary
         with suppress(*_DAMAGE):
-            for record in StreamReader(BytesIO(self._data[start:]), skip_magic=True).records:
+            for record in StreamReader(
+                    BytesIO(self._data[start:]), skip_magic=True, emit_chunks=True).records:
                 if isinstance(record, Schema):
                     summary.schemas[record.id] = record
                 elif isinstance(record, ChannelRecord):
@@ -172,7 +185,7 @@ class McapFile:
                 start = stream.tell()
         self._stopped = start
 
-    def _beginning_of_chunk(self, start: int) -> Iterator[McapRecord]:
+    def _beginning_of_chunk(self, start: int) -> Iterator[McapRecord | Found]:
         """Yield the records that are whole in a chunk that the file ends in, at a byte."""
         with suppress(*_DAMAGE):
             stream = ReadDataStream(BytesIO(self._data[start:start + 100]))
@@ -182,13 +195,9 @@ class McapFile:
                                 stream.read8())
             if kind != Opcode.CHUNK or size > MAX_CHUNK_BYTES:
                 return
-            data = self._data[start + stream.count:]
-            if name == 'zstd':
-                data = zstandard.ZstdDecompressor().stream_reader(data).read(size)
-            elif name == 'lz4':
-                import lz4.frame  # comes with mcap; few recordings need it
-                data = lz4.frame.LZ4FrameDecompressor().decompress(data, size)
-            yield from StreamReader(BytesIO(data), skip_magic=True).records
+            self._budget.take(size)
+            yield from _split(
+                _unpack(name, self._data[start + stream.count:], size), self._budget)
 
     def _unpacked(self, start: int, chunk: Chunk | ChunkIndex) -> list[Found]:
         """Return the messages of a chunk, or of what the summary says of one, at a byte."""
@@ -204,20 +213,25 @@ class McapFile:
             if chunk.uncompressed_size > MAX_CHUNK_BYTES:
                 raise ValueError(f'it claims to unpack to {chunk.uncompressed_size} bytes; at '
                                  f'most {MAX_CHUNK_BYTES} are accepted')
-            if chunk.compression == 'zstd' and zstandard.frame_content_size(chunk.data) not in (
-                    -1, chunk.uncompressed_size):  # counts more for what unpacks than our limit
+            self._budget.take(chunk.uncompressed_size)
+            data = _unpack(chunk.compression, chunk.data, chunk.uncompressed_size + 1)
+            if len(data) != chunk.uncompressed_size:
                 raise ValueError('it unpacks to more than it claims, or to less')
-            return self._scan(breakup_chunk(chunk, validate_crc=True))
+            if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+                raise ValueError('its CRC does not match')
+            return self._scan(list(_split(data, self._budget)))
         except _DAMAGE as error:
             self.losses.append(Loss(f'it is damaged, restore the file from a copy: {error}',
                                     'chunk', start, first, last))
             return []
 
-    def _scan(self, records: Sequence[McapRecord]) -> list[Found]:
+    def _scan(self, records: Sequence[McapRecord | Found]) -> list[Found]:
         """Return the messages among records; take notice of topics, the first of a number."""
         found: list[Found] = []
         for record in records:
-            if isinstance(record, Message):
+            if isinstance(record, tuple):
+                found.append(record)
+            elif isinstance(record, Message):
                 found.append((record.channel_id, record.log_time, record.publish_time,
                               memoryview(record.data)))
             elif isinstance(record, Schema):
@@ -226,7 +240,7 @@ class McapFile:
                 schema = self._schemas.get(record.schema_id, Schema(0, b'', '', ''))
                 self.channels[record.id] = Channel(
                     record.topic, schema.name, record.message_encoding, schema.encoding,
-                    schema.data.decode(errors='replace'))
+                    schema.data[:_MAX_SCHEMA_BYTES].decode(errors='replace'))
         self._counts.update(number for number, *_ in found)
         times = [min(log, FAR) for _, log, *_ in found]
         if times:
@@ -256,3 +270,32 @@ class McapFile:
         elif self._needs_summary:
             self.losses.append(Loss('its summary is damaged, so that nothing tells whether all '
                                     'messages are there', cuts=False))
+
+
+def _unpack(compression: str, data: bytes | memoryview, most: int) -> bytes | memoryview:
+    """Return at most so many of the bytes that were compressed."""
+    if compression == 'zstd':
+        return zstandard.ZstdDecompressor().stream_reader(data).read(most)
+    if compression == 'lz4':
+        import lz4.frame  # comes with mcap; few recordings need it
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, most))
+    if compression:
+        raise ValueError(f'it is compressed by {compression}')
+    return data[:most]
+
+
+def _split(data: bytes | memoryview, budget: Budget) -> Iterator[McapRecord | Found]:
+    """Yield the records of a chunk that are read: messages, topics and their types."""
+    at, view = 0, memoryview(data)
+    while at < len(data):
+        kind, length = _RECORD.unpack_from(data, at)
+        start, at = at + _RECORD.size, at + _RECORD.size + length
+        budget.take(0, 1)
+        if not kind or at > len(data) or (kind == Opcode.MESSAGE and length < _MESSAGE.size):
+            raise ValueError('its records are damaged')
+        if kind == Opcode.MESSAGE:
+            channel, _, log, publish = _MESSAGE.unpack_from(data, start)
+            yield channel, log, publish, view[start + _MESSAGE.size:at]
+        elif kind in (Opcode.SCHEMA, Opcode.CHANNEL):
+            yield (Schema if kind == Opcode.SCHEMA else ChannelRecord).read(
+                ReadDataStream(BytesIO(view[start:at])))

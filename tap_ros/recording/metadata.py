@@ -17,6 +17,7 @@ from typing import Any
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import write_atomically
 from tap_ros.recording.file_bytes import PACKED, unpacked_name
+from tap_ros.recording.trust import parse_json, read_bytes
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
 from tap_ros.text import escaped, listing
 import yaml
@@ -24,8 +25,8 @@ import yaml
 FILE_NAME, MOUNT_NAME = 'metadata.yaml', 'arm_mount.json'
 MAX_BYTES = 2**23  # of metadata.yaml
 DEEPEST = 50  # levels of it; rosbag2 writes 8
+LONGEST = 2**16  # characters of a word without quotes
 _UNUSABLE = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
-_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _KEY = 'rosbag2_bagfile_information'
 
 
@@ -73,15 +74,24 @@ def bag_information(files: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
+    """Takes no `<<`, which can make a short text endless."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Leave `<<` as it is; it is no key then."""
+
+
 def from_yaml(text: str | bytes) -> Any:
     """Return a value; raise ValueError for one so deep that libyaml would end the process."""
     depth = 0
-    for event in yaml.parse(text, _LOADER):
+    for event in yaml.parse(text, _Loader):
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
             raise ValueError(f'it is more than {DEEPEST} levels deep')
-    return yaml.load(text, _LOADER)
+        if isinstance(event, yaml.ScalarEvent) and not event.style and len(event.value) > LONGEST:
+            raise ValueError(f'it has a word of {len(event.value)} letters')  # 1:1:1... takes days
+    return yaml.load(text, _Loader)
 
 
 def to_yaml(value: Any) -> str:
@@ -108,7 +118,7 @@ def save(folder: str | Path, files: Sequence[dict[str, Any]]) -> None:
 
 def natural(path: Path) -> list[int | str]:
     """Return what sorts part_10 behind part_2."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', str(path))]
+    return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', str(path))]
 
 
 def files_by_number(folder: str | Path) -> list[Path]:
@@ -141,6 +151,8 @@ def bag_files(folder: str | Path) -> list[Path]:
         storage, paths = information['storage_identifier'], information['relative_file_paths']
         if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
             raise ValueError('relative_file_paths is no list of names')
+        if not isinstance(storage, str):  # what is no text may be endless as text
+            raise ValueError('storage_identifier is no name')
         if len(set(paths)) < len(paths):
             raise ValueError('relative_file_paths names a file twice')
     except OSError as error:
@@ -210,12 +222,14 @@ def read_mount(folder: str | Path) -> ArmMount:
         return ArmMount()
     expected = {**asdict(ArmMount().mount), 'opening': 0.0, 'arm': DEFAULT_ARM}
     try:
-        values = {'arm': DEFAULT_ARM} | json.loads(path.read_bytes())  # earlier ones lack it
+        values = {'arm': DEFAULT_ARM} | parse_json(
+            read_bytes(path, MAX_BYTES))  # earlier ones lack it
         x, y, z = map(float, values['position'])
         yaw, tool, opening = (float(values[name]) for name in ('yaw', 'tool', 'opening'))
         if not isfinite(x + y + z + yaw + tool + opening):
             raise ValueError('it holds infinity or NaN')
         return ArmMount(Mount((x, y, z), yaw, tool), opening, get_arm(values['arm']).name)
-    except (ConfigError, OSError, LookupError, ValueError, TypeError) as error:
-        raise RecordingError(f'{path}: cannot be used ({error}); expected values such as '
+    except (ConfigError, RecordingError, OSError, LookupError, ValueError, TypeError,
+            OverflowError) as error:
+        raise RecordingError(f'{path}: cannot be used ({escaped(error)}); expected values such as '
                              f'{json.dumps(expected)}') from error

@@ -10,7 +10,6 @@ import shlex
 import shutil
 import sqlite3
 import sys
-from types import SimpleNamespace
 
 import cv2
 from made_bags import camera, joints, record, SECOND, write_mcap
@@ -109,7 +108,6 @@ def test_mcap_beside_other_bags_is_refused_by_name(tmp_path):
 
 @pytest.mark.parametrize('name, content, command', [
     ('episode_0.hdf5', b'\x89HDF\r\n\x1a\n' + bytes(99), 'import-arrays'),
-    ('pusht.zarr/.zgroup', b'{}', 'import-arrays'),
     ('robomimic/low.h5', b'\x89HDF\r\n\x1a\n' + bytes(99), 'import-arrays'),
     ('set/meta/info.json', b'{}', 'import-lerobot'),
     ('bridge/1.0.0/bridge-train.tfrecord-00000-of-00002', b'', 'import-tfrecord'),
@@ -119,7 +117,7 @@ def test_for_what_is_no_bag_the_command_is_told(name, content, command, tmp_path
     file = tmp_path / 'in' / name
     file.parent.mkdir(parents=True)
     file.write_bytes(content)
-    given = {'info.json': file.parents[1], '.zgroup': file.parent}.get(file.name, file)
+    given = file.parents[1] if file.name == 'info.json' else file
     for path in {given, tmp_path / 'in' / name.split('/')[0]}:
         assert main(['inspect', str(path)]) == 1
         said = capsys.readouterr().err
@@ -159,24 +157,26 @@ def test_what_is_no_bag_but_will_be_one_is_told_with_the_command(tmp_path, capsy
     assert f'rosbags-convert --src {tmp_path}/a.bag --dst ' in capsys.readouterr().err
 
 
-def files_of(pictures):
-    """Return pictures as JPEG files in the ways in which h5py gives rows of bytes, one padded."""
-    data = [cv2.imencode('.jpg', picture)[1].tobytes() for picture in pictures]
-    rows = np.empty(len(data), object)
-    rows[:] = [np.frombuffer(each + bytes(40), np.uint8) for each in data]
-    return np.array(data, f'S{max(map(len, data))}'), np.array(
-        data, f'V{max(map(len, data))}'), rows
-
-
-def test_cameras_whose_arrays_end_alike_are_told_apart(tmp_path, capsys, monkeypatch):
+def test_cameras_whose_arrays_end_alike_are_told_apart(tmp_path, capsys):
+    h5py = pytest.importorskip('h5py')
     pictures = np.random.default_rng(0).integers(0, 256, (4, 8, 12, 3), np.uint8)
-    cameras = dict(zip(('base_camera', 'cam_2', 'hand'), files_of(pictures)))
-    tree = {f'traj_{i}': {'obs': {name: {'rgb': files, 'depth': np.ones((4, 8, 12, 1))}
-                                  for name, files in cameras.items()}} for i in range(2)}
-    monkeypatch.setitem(sys.modules, 'h5py', SimpleNamespace(File=lambda path, mode: tree))
+    files = [cv2.imencode('.jpg', picture)[1].tobytes() for picture in pictures]
+    longest = max(map(len, files))
+    with h5py.File(tmp_path / 'in.h5', 'w') as file:
+        for i in range(2):
+            for name, values in (('base_camera', np.array(files, f'S{longest}')),
+                                 ('cam_2', np.array(files, f'V{longest}')), ('hand', None)):
+                place = f'traj_{i}/obs/{name}'
+                file[f'{place}/depth'] = np.ones((4, 8, 12, 1))
+                if values is not None:
+                    file[f'{place}/rgb'] = values
+                    continue
+                rows = file.create_dataset(f'{place}/rgb', 4, h5py.vlen_dtype(np.uint8))
+                for row, data in enumerate(files):
+                    rows[row] = np.frombuffer(data + bytes(40), np.uint8)
     words = ['import-arrays', str(tmp_path / 'in.h5'), '--out', str(tmp_path / 'bag')]
     assert main(words) == 1
-    names = [f'obs/{name}/rgb' for name in cameras]
+    names = [f'obs/{name}/rgb' for name in ('base_camera', 'cam_2', 'hand')]
     assert f'--camera: expected one of {", ".join(names)}' in capsys.readouterr().err
     for number, name in enumerate(names):
         assert main([*words[:3], str(tmp_path / str(number)), '--camera', name]) == 0
@@ -185,25 +185,19 @@ def test_cameras_whose_arrays_end_alike_are_told_apart(tmp_path, capsys, monkeyp
         assert [len(episode) for episode in found] == [4, 4]
 
 
-@pytest.mark.parametrize('name', ['h5py', 'zarr'])
-def test_arrays_of_pictures_are_imported(name, tmp_path, capsys, monkeypatch):
-    """The libraries are stood in for; both give trees of dicts and arrays."""
-    pictures = np.random.default_rng(0).integers(0, 256, (9, 8, 12, 3), np.uint8)
-    trees = {
-        'h5py': {'data': {f'demo_{i}': {'obs': {'front': pictures[i:i + 3], 'joints': np.ones(3)},
-                                        'next_obs': {'front': pictures[i + 1:i + 4]}}
-                          for i in (2, 0, 1)}},
-        'zarr': {'data': {'img': np.moveaxis(pictures, -1, 1).astype(np.float32)},
-                 'meta': {'episode_ends': np.array([4, 9])}}}
-    monkeypatch.setitem(sys.modules, name, SimpleNamespace(
-        File=lambda path, mode: trees[name], open=lambda path, mode: trees[name]))
-    path = tmp_path / 'in'
-    path.mkdir() if name == 'zarr' else path.touch()
-    assert main(['import-arrays', str(path), '--out', str(tmp_path / 'bag'), '--fps', '5']) == 0
-    found = [episode.frames for episode in open_recordings(tmp_path / 'bag')]
-    cuts = [(0, 3), (1, 4), (2, 5)] if name == 'h5py' else [(0, 4), (4, 9)]
-    for frames, (begin, end) in zip(found, cuts, strict=True):
-        np.testing.assert_array_equal(frames, pictures[begin:end])
-    monkeypatch.setitem(sys.modules, name, None)
-    assert main(['import-arrays', str(path), '--out', str(tmp_path / 'c')]) == 1
-    assert f'pip install {name}' in capsys.readouterr().err
+def test_arrays_of_pictures_are_imported_in_the_order_of_their_groups(
+        tmp_path, capsys, monkeypatch):
+    h5py = pytest.importorskip('h5py')
+    pictures = np.random.default_rng(0).integers(0, 256, (13, 8, 12, 3), np.uint8)
+    with h5py.File(tmp_path / 'in.hdf5', 'w') as file:
+        for i in (10, 0, 2):
+            demo = file.create_group(f'data/demo_{i}')
+            demo['obs/front'] = np.moveaxis(pictures[i:i + 3], -1, 1) / np.float32(255)
+            demo['obs/joints'], demo['next_obs/front'] = np.ones(3), pictures[i + 1:i + 4]
+    words = ['import-arrays', str(tmp_path / 'in.hdf5'), '--fps', '5', '--out']
+    assert main([*words, str(tmp_path / 'bag')]) == 0
+    for episode, i in zip(open_recordings(tmp_path / 'bag'), (0, 2, 10), strict=True):
+        np.testing.assert_array_equal(episode.frames, pictures[i:i + 3])
+    monkeypatch.setitem(sys.modules, 'h5py', None)
+    assert main([*words, str(tmp_path / 'c')]) == 1
+    assert 'pip install h5py' in capsys.readouterr().err

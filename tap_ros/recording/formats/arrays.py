@@ -1,35 +1,43 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Import pictures that stand as arrays in HDF5 files (ALOHA, robomimic) or zarr stores.
+Import pictures that stand as arrays in HDF5 files, as of ALOHA and robomimic.
 
 An array of pictures is (N, H, W, 3 or 4), (N, 3, H, W), or of N JPEG or PNG files, whose bytes may
 be padded. Its last name is the camera, or all names where several end alike, as base_camera/rgb
 and hand_camera/rgb; arrays of one camera in several groups with a number, such as data/demo_7/obs,
-are an episode each, and so is each file. meta/episode_ends, as of diffusion policy, cuts an array
-into episodes.
+are an episode each, and so is each file.
+
+Only what is stored in the file itself is read: no links, no arrays that other files hold, and
+nothing that a plug-in has to unpack.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from functools import partial
 from itertools import count
+import math
 from pathlib import Path
 import re
 from typing import Any
 
 import numpy as np
+from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.file_bytes import what_else
+from tap_ros.recording.foreign import what_is
 from tap_ros.recording.formats.pictures import (
     decoded,
+    find_files,
     Lacking,
     make_episode,
     Options,
     write_bag,
 )
 from tap_ros.recording.metadata import natural
+from tap_ros.recording.trust import Budget, MOST_BYTES, MOST_FRAMES
 from tap_ros.text import escaped, listing
 
 FPS = 10.0  # where nobody says another
@@ -41,45 +49,34 @@ def run(args: Options) -> None:
 
     :raises TapError: for what cannot be read, and a folder that holds something.
     """
-    files = [file for path in map(Path, args.paths) for file in (
-        sorted((file for file in path.rglob('*') if file.suffix in ('.hdf5', '.h5')), key=natural)
-        or [path])]
+    import h5py
+    while h5py.h5pl.size():  # a plug-in for an array is code
+        h5py.h5pl.remove(0)
     lacking = Lacking()
+    files = find_files(args.paths, ('*.hdf5', '*.h5'), lacking)
 
     def episodes() -> Iterator[Episode]:
         numbers = count()
         for file in files:
-            with lacking.passing_over('file', escaped(file.name)):
-                for pictures, number in zip(_episodes(_open(file), args.camera), numbers):
-                    with lacking.passing_over('episode', str(number)):
-                        frames, rows = decoded(pictures, lambda each: args.cut.image(_picture(
-                            each)), lacking, f'episode {number}')
-                        yield make_episode(
-                            frames, rows / (args.fps or FPS), task=args.task, seed=number)
+            with lacking.passing_over('file', place := escaped(file.name)):
+                if why := (what_is if file.name.endswith('.zarr.zip') else what_else)(file):
+                    raise RecordingError(why)
+                with h5py.File(file, 'r') as root:
+                    arrays = dict(_arrays(root, lacking, Budget(file.stat().st_size)))
+                    for name, number in zip(_chosen(arrays, args.camera), numbers):
+                        with lacking.passing_over('array', f'{escaped(name)} of {place}'):
+                            frames, rows = decoded(
+                                arrays[name](), lambda each: args.cut.image(_picture(each)),
+                                lacking, f'episode {number}')
+                            yield make_episode(
+                                frames, rows / (args.fps or FPS), task=args.task, seed=number)
 
     print(write_bag(args, episodes(), lacking=lacking))
 
 
-def _open(path: Path) -> Any:
-    """Open a file or store: a tree of groups, which act as dicts, and arrays."""
-    name = 'zarr' if path.is_dir() or path.suffix == '.zip' else 'h5py'
-    if name == 'h5py' and (why := what_else(path)):
-        raise RecordingError(why)
-    try:
-        if name == 'zarr':
-            import zarr  # type: ignore[import-not-found]
-            return zarr.open(str(path), mode='r')
-        import h5py  # type: ignore[import-not-found]
-        return h5py.File(path, 'r')
-    except ImportError as error:
-        raise ConfigError(f'{name} is not installed; type `pip install {name}`') from error
-
-
-def _episodes(root: Any, camera: str) -> Iterator[Any]:
-    """Yield the arrays of pictures of each episode of a camera."""
-    arrays = dict(_arrays(root))
-    found = {name: array for name, array in arrays.items() if _holds_pictures(array)}
-    keys = {name: _camera(name) for name in found}
+def _chosen(arrays: Collection[str], camera: str) -> list[str]:
+    """Return the names of the arrays of a camera, each an episode."""
+    keys = {name: _camera(name) for name in arrays}
     short = Counter(key.rpartition('/')[2] for key in set(keys.values()))
     called = {name: last if short[last := key.rpartition('/')[2]] == 1 else key
               for name, key in keys.items()}
@@ -88,13 +85,8 @@ def _episodes(root: Any, camera: str) -> Iterator[Any]:
         raise ValueError('it holds no array of pictures')
     if camera not in cameras and (camera or len(cameras) > 1):
         raise ConfigError(f'--camera: expected one of {listing(cameras)}')
-    chosen = camera or cameras[0]
-    ends = arrays.get('meta/episode_ends')
-    for name in sorted(found, key=lambda name: natural(Path(name))):
-        if called[name] == chosen:
-            cuts = [0, *(np.asarray(ends[:]).tolist() if ends is not None else [len(found[name])])]
-            for begin, end in zip(cuts, cuts[1:]):
-                yield found[name][begin:end]
+    return [name for name in sorted(arrays, key=lambda name: natural(Path(name)))
+            if called[name] == (camera or cameras[0])]
 
 
 def _camera(name: str) -> str:
@@ -104,29 +96,72 @@ def _camera(name: str) -> str:
         r'\d$', group)), last])
 
 
-def _arrays(group: Any, above: str = '') -> Iterator[tuple[str, Any]]:
-    """Yield the arrays below a group, with their paths."""
-    for name in set(group) - {'next_obs'}:  # robomimic's observations once more
-        if hasattr(group[name], 'dtype'):
-            yield above + name, group[name]
-        else:
-            yield from _arrays(group[name], f'{above}{name}/')
+def _arrays(root: Any, lacking: Lacking,
+            budget: Budget) -> Iterator[tuple[str, Callable[[], Iterable[Any]]]]:
+    """Yield the arrays of pictures in a file: their paths, and what reads them."""
+    import h5py
+    groups, seen = [('', root)], set()
+    while groups:
+        above, group = groups.pop()
+        if (place := h5py.h5o.get_info(group.id).addr) in seen:  # groups may hold each other
+            continue
+        seen.add(place)
+        for name in set(group) - {'next_obs'}:  # robomimic's observations once more
+            with lacking.passing_over('array', escaped(above + name)):
+                if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                    continue  # to another file, or what is read anyway
+                one = group[name]
+                if isinstance(one, h5py.Group):
+                    groups.append((f'{above}{name}/', one))
+                elif isinstance(one, h5py.Dataset) and _holds_pictures(one):
+                    yield above + name, partial(_read, one, budget)
+
+
+def _read(array: Any, budget: Budget) -> Iterable[Any]:
+    """Return the rows of an array; of an array of any length one after the other."""
+    if array.dtype.kind == 'O':
+        return (array[row] for row in range(len(array)))
+    if array.nbytes > MOST_BYTES:
+        raise RecordingError(f'it has more than {MOST_BYTES >> 30} GiB')
+    budget.take(array.nbytes)
+    return array[:]
 
 
 def _holds_pictures(array: Any) -> bool:
-    """Tell whether an array is of pictures."""
-    if len(array.shape) in (1, 2) and array.dtype.kind in 'uSVO' and len(array):
-        first = array[0]
-        is_file = isinstance(first, bytes | np.void) or getattr(first, 'dtype', None) == np.uint8
-        return is_file and bytes(first).startswith((b'\xff\xd8\xff', b'\x89PNG'))
-    return len(array.shape) == 4 and (array.shape[1] == 3 or array.shape[3] in (3, 4))
+    """
+    Tell whether an array is of pictures.
+
+    :raises RecordingError: for one whose values are not all in its own file.
+    """
+    shape, kind = tuple(array.shape or ()), array.dtype.kind
+    is_files = len(shape) in (1, 2) and kind in 'uSVO' and 0 not in shape
+    if not is_files and not (len(shape) == 4 and kind in 'uif' and 0 not in shape
+                             and (shape[1] == 3 or shape[3] in (3, 4))):
+        return False
+    row_bytes = math.prod(shape[1:]) * array.dtype.itemsize
+    if array.is_virtual or array.external:
+        raise RecordingError('its values are in other files, which are not read')
+    if not array.id.get_storage_size():
+        raise RecordingError('its values were never written')
+    if len(array) > MOST_FRAMES:
+        raise RecordingError(f'it has {len(array)} rows; at most {MOST_FRAMES} are read')
+    if row_bytes > 8 * MAX_PICTURE_BYTES or math.prod(
+            array.chunks or ()) * array.dtype.itemsize > MOST_BYTES:
+        raise RecordingError(f'its pictures have {row_bytes} bytes')
+    if not is_files:
+        return True
+    first = array[0]
+    is_file = isinstance(first, bytes | np.void) or getattr(first, 'dtype', None) == np.uint8
+    return is_file and bytes(first).startswith((b'\xff\xd8\xff', b'\x89PNG'))
 
 
 def _picture(values: Any) -> np.ndarray:
     """Return a picture, uint8 (H, W, 3), of a file with zeros behind it, or of pixels."""
     if np.ndim(values) < 2:
         return decompress(bytes(values), 'unknown')
-    if values.dtype.kind == 'f' and values.max() <= 1:
-        values = values * 255
+    if values.dtype.kind == 'f':
+        if not np.isfinite(values).all():
+            raise ValueError('it holds NaN or infinity')
+        values = values * 255 if values.max() <= 1 else values
     pixels = np.asarray(values).round().clip(0, 255).astype(np.uint8)
     return pixels[..., :3] if pixels.shape[-1] in (3, 4) else np.moveaxis(pixels, 0, -1)

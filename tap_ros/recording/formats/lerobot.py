@@ -15,13 +15,13 @@ episodes.jsonl), data a row a frame. Pictures are files in the rows, or videos, 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-import json
 from pathlib import Path
+import re
 from typing import Annotated, Any
 import warnings
 
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS
+from tap_ros.contract import GRIPPER_JOINTS, MAX_PICTURE_BYTES
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
@@ -33,11 +33,14 @@ from tap_ros.recording.formats.pictures import (
     decoded,
     Lacking,
     make_episode,
+    MOST_CHARACTERS,
     Target,
     video_frames,
     write_bag,
 )
 from tap_ros.recording.marks import beside, write_marks
+from tap_ros.recording.metadata import natural
+from tap_ros.recording.trust import Budget, inside, parse_json, read_bytes
 from tap_ros.text import escaped, listing
 from tyro import conf
 
@@ -48,7 +51,10 @@ NAMES = {ACTION: ['dx', 'dy', 'dz', 'opening'], STATE: list(GRIPPER_JOINTS)}  # 
 INDICES = ('frame_index', 'episode_index', 'index', 'task_index')  # columns that all sets have
 SUBTASK = 'subtask_index'  # column of the sets that have meta/subtasks.parquet, too
 SEED, OUTCOME = 'tap_ros/seed', 'tap_ros/outcome'  # columns of ours beside LeRobot's
-_INFO_BYTES = 2**24
+_OF_EPISODES = 'episode_index', 'length', 'tasks', 'dataset_from_index', SEED, OUTCOME
+_LINES = 'meta/episodes.jsonl'
+_MOST_BYTES, _MOST_ROWS, _MOST_EPISODES = 2**26, 10**7, 10**6  # of JSON, of a table, of a set
+_BATCH = 256  # rows that are read at once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +79,7 @@ def run(args: Options) -> None:
     """
     data = DataSet(args.path, args.camera)
     said = write_bag(args, data.episodes(args.cut), len(data.rows), data.lacking)
-    print(f'{said} of {data.camera}')
+    print(f'{said} of {escaped(data.camera)}')
     if any(data.marks):
         path = beside(args.out)
         write_marks(path, open_recordings([args.out]), [args.out], {
@@ -102,19 +108,20 @@ class DataSet:
         self.folder = Path(folder)
         place = escaped(self.folder / INFO)
         try:
-            with open(self.folder / INFO, 'rb') as stream:
-                info = json.loads(stream.read(_INFO_BYTES))
+            info = parse_json(read_bytes(inside(self.folder, INFO), _MOST_BYTES))
             version, self.fps = str(info['codebase_version']), float(info['fps'])
             self.features = dict(info['features'])
             self._data_path, self._video_path = str(info['data_path']), info.get('video_path')
-            self._chunk, count = int(info.get('chunks_size', 1000)), int(
+            self._chunk, count = int(info.get('chunks_size') or 1000), int(
                 info.get('total_episodes', 0))
             cameras = {name: feature for name, feature in self.features.items()
                        if feature['dtype'] in ('image', 'video')}
-        except OSError as error:
-            raise RecordingError(f'{place}: cannot be read, so this is no LeRobot data set: '
-                                 f'{error.strerror}') from error
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            colour = [name for name in cameras if not _is_depth(self.features[name])]
+            self._objects = self._object_names()
+        except (OSError, RecordingError) as error:
+            raise RecordingError(f'{escaped(self.folder)}: is no LeRobot data set: '
+                                 f'{escaped(error)}') from error
+        except DAMAGE as error:
             raise RecordingError(f'{place}: not the description of a LeRobot data set; it lacks '
                                  f'or garbles {escaped(error)}') from error
         if not version.startswith(('v2.', 'v3.')) or not 0 < self.fps <= 1e6:
@@ -124,17 +131,18 @@ class DataSet:
         self.lacking = Lacking()
         self.marks: list[list[int]] = []
         self.rows = self._read_rows(count)
-        colour = [name for name in cameras if not self._is_depth(name)]
+        colour = [name for name in colour if not self._is_deep(name)]
         if camera not in cameras and (camera or len(colour) != 1):
             raise ConfigError(f'{escaped(self.folder)}: --camera: expected one of '
                               f'{listing(colour or cameras) or "its cameras, but there are none"}')
         self.camera = camera or colour[0]
-        self._objects = self._object_names()
         taken = {self.camera, 'timestamp', SUBTASK, *INDICES, *filter(self._is_ours, NAMES)}
         if self._objects:
             taken.add(OBJECTS)
         self.unused = sorted(self.features.keys() - taken)
         self._starts = self._find_starts() if self._is_video else {}
+        self.rows = [row for row in self.rows
+                     if row['episode_index'] in self._starts or not self._is_video]
         self._video: _Video | None = None
 
     def episodes(self, crop: Crop) -> Iterator[Episode]:
@@ -167,35 +175,38 @@ class DataSet:
         """Return the objects whose pixels the set has as we export them."""
         columns = list(map(str, self._flat_names(OBJECTS)))
         names = tuple(column.removesuffix('_u') for column in columns[::2])
-        return names if object_columns(names) == columns else ()
+        return tuple(map(escaped, names)) if object_columns(names) == columns else ()
 
     def _read_rows(self, count: int) -> list[dict[str, Any]]:
         """Return the rows of meta/episodes, or the lines of episodes.jsonl, of so many."""
-        rows: list[dict[str, Any]] = []
-        for file in sorted((self.folder / 'meta' / 'episodes').glob('*/*.parquet')):
+        found: list[Any] = []
+        for file in sorted((self.folder / 'meta' / 'episodes').glob('*/*.parquet'), key=natural):
             with self.lacking.passing_over('file', f'meta/episodes/{escaped(file.name)}'):
-                table = _read_parquet(file)
-                rows += table.select([name for name in table.column_names
-                                      if not name.startswith('stats/')]).to_pylist()
-        lines = self.folder / 'meta' / 'episodes.jsonl'
-        if not rows and lines.is_file():
-            for number, line in enumerate(filter(None, lines.read_bytes().splitlines())):
-                with self.lacking.passing_over('line', f'{number} of meta/episodes.jsonl'):
-                    row = json.loads(line)
-                    rows.append(row | {'length': int(row['length'])})
-        with self.lacking.passing_over('file', 'meta/episodes'):
-            rows = sorted(rows, key=lambda row: (int(row['episode_index']), int(row['length'])))
+                table = self._read_parquet(file.relative_to(self.folder))
+                for part in table.select([name for name in table.column_names if name.startswith(
+                        (*_OF_EPISODES, 'data/', 'videos/'))]).to_batches():
+                    found += map(_cut_short, part.to_pylist())
+        if not found and (self.folder / _LINES).exists():
+            with self.lacking.passing_over('file', _LINES):
+                found = read_bytes(inside(self.folder, _LINES), _MOST_BYTES).splitlines()
+        rows: list[dict[str, Any]] = []
+        for number, one in enumerate(filter(None, found[:_MOST_EPISODES])):
+            with self.lacking.passing_over('row', f'{number} of meta/episodes'):
+                row = parse_json(one) if isinstance(one, bytes) else one
+                row = _cut_short(row) | {
+                    name: int(row[name]) for name in ('episode_index', 'length')}
+                if min(row['episode_index'], row['length'] - 1) < 0:
+                    raise ValueError('it counts below zero')
+                rows.append(row)
+        rows.sort(key=lambda row: (row['episode_index'], row['length']))
         if not rows:
             raise RecordingError(f'{escaped(self.folder)}: meta/episodes holds no episode')
         if len(rows) < count:
             self.lacking.note(f'meta/episodes tells of {len(rows)} of {count} episodes', '', '')
         return rows
 
-    def _is_depth(self, camera: str) -> bool:
-        """Tell whether a feature is of depth: by its description, or 16 bits a pixel."""
-        about = self.features[camera].get('info') or {}
-        if any(about.get(name) for name in ('video.is_depth_map', 'is_depth_map')):
-            return True
+    def _is_deep(self, camera: str) -> bool:
+        """Tell whether the pictures of a feature have 16 bits a pixel, as of depth."""
         if self.features[camera]['dtype'] == 'video':
             return False
         with suppress(*DAMAGE):
@@ -204,18 +215,22 @@ class DataSet:
         return False
 
     def _path(self, pattern: object, row: dict[str, Any], part: str) -> Path:
-        """Return the path of a file of an episode; part is data, or videos/ and the camera."""
-        index = int(row['episode_index'])
-        return self.folder / str(pattern).format(
-            video_key=self.camera if part != 'data' else '', episode_index=index,
-            episode_chunk=index // self._chunk, **{
-                name: row.get(f'{part}/{name}', 0) for name in ('chunk_index', 'file_index')})
+        """Return the name of a file of an episode; part is data, or videos/ and the camera."""
+        index = row['episode_index']
+        values = {'video_key': self.camera, 'episode_index': index,
+                  'episode_chunk': index // self._chunk, **{
+                      name: int(row.get(f'{part}/{name}', 0))
+                      for name in ('chunk_index', 'file_index')}}
+        return Path(re.sub(  # not str.format, which a pattern can make do much else
+            r'[{](\w+)(?::0(\d)d)?[}]',
+            lambda match: str(values[match[1]]).zfill(int(match[2] or 0)), str(pattern)))
 
     def _rows_of(self, row: dict[str, Any]) -> Any:
         """Return the rows of an episode as a table."""
         path = self._path(self._data_path, row, 'data')
         if self._file is None or self._file[0] != path:
-            self._file = path, _read_parquet(path)
+            self._file = None  # before another one is in memory
+            self._file = path, self._read_parquet(path)
         table, T = self._file[1], row['length']
         first = table['index'][0].as_py()
         part = table.slice(row.get('dataset_from_index', first) - first, T)
@@ -229,13 +244,16 @@ class DataSet:
         ends: dict[Path, float] = {}  # of the episodes so far
         overlaps = 0
         for row in self.rows:
-            path = self._path(self._video_path, row, f'videos/{self.camera}')
-            told = row.get(f'videos/{self.camera}/from_timestamp', 0.0)
-            free = ends.get(path, told)
-            is_within = told < free - 0.5 / self.fps
-            overlaps += is_within
-            starts[row['episode_index']] = start = free if is_within else told
-            ends[path] = start + row['length'] / self.fps
+            with self.lacking.passing_over('episode', str(row['episode_index'])):
+                path = self._path(self._video_path, row, f'videos/{self.camera}')
+                told = float(row.get(f'videos/{self.camera}/from_timestamp', 0.0))
+                if not 0 <= told < 1e6:
+                    raise ValueError(f'it begins at {told:g} s of its video')
+                free = ends.get(path, told)
+                is_within = told < free - 0.5 / self.fps
+                overlaps += is_within
+                starts[row['episode_index']] = start = free if is_within else told
+                ends[path] = start + row['length'] / self.fps
         if overlaps:
             warnings.warn(f'{escaped(self.folder)}: {overlaps} episodes begin, by their '
                           'from_timestamp, within the one before; they are taken one after the '
@@ -246,8 +264,8 @@ class DataSet:
         """Return the episode of a row."""
         part, size = self._rows_of(row), (1, 1)
         cells, show = self._filmed(row, part) if self._is_video else (
-            part[self.camera].to_pylist(),
-            lambda cell: decompress(self._file_of(cell), 'unknown'))
+            part[self.camera],  # rows may share what is in the file once
+            lambda cell: decompress(self._file_of(cell.as_py()), 'unknown'))
 
         def decode(cell: Any) -> np.ndarray:
             nonlocal size
@@ -279,13 +297,32 @@ class DataSet:
             seconds = told  # another rate than that of the description
         return make_episode(
             frames, seconds[kept], self._objects,
-            task=str((row.get('tasks') or [''])[0]), seed=int(row.get(SEED, row['episode_index'])),
+            task=row['tasks'], seed=int(row.get(SEED, row['episode_index'])),
             outcome=outcome if outcome in OUTCOMES else '', **known)
+
+    def _read_parquet(self, name: Path) -> Any:
+        """Read a table of the set, in parts, as a short file can hold a long one."""
+        import pyarrow
+        from pyarrow import parquet
+        path = inside(self.folder, name)
+        try:
+            with parquet.ParquetFile(path) as file:
+                if file.metadata.num_rows > _MOST_ROWS:
+                    raise ValueError(f'it has more than {_MOST_ROWS} rows')
+                budget, parts = Budget(path.stat().st_size), []
+                for part in file.iter_batches(_BATCH):
+                    budget.take(part.nbytes)
+                    parts.append(part)
+                return pyarrow.Table.from_batches(parts)
+        except (*DAMAGE, pyarrow.ArrowException) as error:
+            why = what_else(path) or f'cannot be read: {escaped(error, 200)}'
+            raise RecordingError(f'{escaped(name)}: {why}') from error
 
     def _file_of(self, cell: Any) -> bytes:
         """Return the picture file of a row: its bytes, or what has its name."""
         data = cell.get('bytes') if isinstance(cell, dict) else None
-        return data or (self.folder / str(cell['path'])).read_bytes()
+        return data if isinstance(data, bytes) and data else read_bytes(
+            inside(self.folder, str(cell['path'])), MAX_PICTURE_BYTES)
 
     def _filmed(self, row: dict[str, Any],
                 part: Any) -> tuple[list[float], Callable[[float], np.ndarray]]:
@@ -293,14 +330,13 @@ class DataSet:
         path = self._path(self._video_path, row, f'videos/{self.camera}')
         times = self._starts[row['episode_index']] + np.array(part['timestamp'], float).ravel()
         if self._video is None or self._video.path != path or self._video.now[0] > times[0]:
-            self._video = _Video(path)
+            self._video = _Video(path, video_frames(inside(self.folder, path)))
         video = self._video
 
         def show(at: float) -> np.ndarray:
             seen, picture = video.at(at)
             if abs(seen - at) > 1 / self.fps:
-                raise RecordingError(
-                    f'{path.relative_to(self.folder)} has no frame at {at:.3f} s')
+                raise RecordingError(f'{escaped(path)} has no frame at {at:.3f} s')
             return picture
         return times.tolist(), show
 
@@ -309,13 +345,17 @@ class _Video:
     """
     A video from which frames are taken one after the other, by their times.
 
-    :param path: of the file.
+    :param path: its name in the set.
+    :param frames: as video_frames yields them.
     :ivar now: (seconds, picture) that was taken last.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path, self._frames = path, video_frames(path)
-        self.now, self._next = next(self._frames), next(self._frames, None)
+    def __init__(self, path: Path, frames: Iterator[tuple[float, np.ndarray]]) -> None:
+        self.path, self._frames = path, frames
+        first = next(frames, None)
+        if not first:
+            raise RecordingError(f'{escaped(path)} has no frame')
+        self.now, self._next = first, next(frames, None)
 
     def at(self, seconds: float) -> tuple[float, np.ndarray]:
         """Return the frame nearest to a time, of those not before the last one."""
@@ -329,14 +369,14 @@ def object_columns(names: tuple[str, ...]) -> list[str]:
     return [f'{name}_{axis}' for name in names for axis in 'uv']
 
 
-def _read_parquet(path: Path) -> Any:
-    """Read a table."""
-    import pyarrow
-    from pyarrow import parquet
-    if not path.is_file():
-        raise RecordingError(f'{escaped(path)} is not there')
-    try:
-        return parquet.ParquetFile(path).read()
-    except (OSError, pyarrow.ArrowException) as error:
-        why = what_else(path) or f'cannot be read: {escaped(error, 200)}'
-        raise RecordingError(f'{escaped(path)}: {why}') from error
+def _is_depth(feature: dict[str, Any]) -> bool:
+    """Tell whether a feature is of depth by its description."""
+    about = feature.get('info') or {}
+    return any(about.get(name) for name in ('video.is_depth_map', 'is_depth_map'))
+
+
+def _cut_short(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row of meta/episodes with the beginning of its task alone, as text."""
+    tasks = row.get('tasks')
+    return row | {'tasks': str(tasks[0] if isinstance(tasks, list) and tasks else tasks or '')[
+        :MOST_CHARACTERS]}

@@ -11,6 +11,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+import os
 from pathlib import Path
 import shutil
 from typing import Annotated, Any
@@ -18,6 +20,7 @@ import warnings
 
 import cv2
 import numpy as np
+from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.files import only_writer, storage_errors
 from tap_ros.images.crop import Crop
@@ -25,16 +28,21 @@ from tap_ros.options import default_text, Folder
 from tap_ros.recording.damage import describe, Loss
 from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.file_bytes import what_else
-from tap_ros.recording.foreign import VIDEOS
+from tap_ros.recording.foreign import VIDEOS, what_is
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading import Part
+from tap_ros.recording.trust import inside, MOST_BYTES, MOST_FRAMES, regular
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 from tap_ros.text import escaped, listing
 from tqdm import tqdm
 from tyro import conf
 
 EPISODES_PER_FILE = 25
-DAMAGE = (ImageError, RecordingError, OSError, LookupError, TypeError, ValueError)
+DAMAGE = (ImageError, RecordingError, OSError, LookupError, TypeError, ValueError, AttributeError,
+          ArithmeticError, MemoryError, RuntimeError, cv2.error)  # of files made by others
+_MOST_SECONDS = 86400  # of a demonstration
+MOST_CHARACTERS = 1000  # of a task
+_FORMATS = 'mov,matroska,avi,h264'  # of videos, as FFmpeg calls them: none that names other files
 EPISODE_SPACING_NS = 60 * 10**9  # between the end of an episode and the start of the next
 Paths = Annotated[conf.Positional[tuple[str, ...]], conf.arg(
     metavar='PATH [PATH ...]', help_behavior_hint='(required)')]
@@ -65,8 +73,8 @@ class Options(Target):
     """
     Options of the commands that import pictures.
 
-    :param paths: files, one camera's videos in the order of the demonstrations, or folders that
-        hold some at any depth; zarr stores.
+    :param paths: files, or folders that hold some at any depth; they are taken in the order of
+        the numbers in their names.
     :param camera: NAME of the pictures, of videos that of the files without ending; needed where
         there are several cameras.
     :param fps: frames a second; 0: as videos say, 10 of arrays and 5 of TFRecord files.
@@ -90,27 +98,64 @@ def run(args: Options) -> None:
 
     :raises TapError: for what cannot be read, and a folder that holds something.
     """
-    files = [file for path in args.paths for file in _find_videos(Path(path), args.camera)]
     lacking = Lacking()
+    files = [file for path in args.paths for file in _of_camera(
+        Path(path), find_files(
+            [path], [f'*{end}' for end in VIDEOS], lacking), args.camera)]
 
     def episodes() -> Iterator[Episode]:
-        for number, path in enumerate(files):
+        for number, path in enumerate(sorted(files, key=natural)):
             with lacking.passing_over('video', escaped(path.name)):
-                seconds, frames = zip(*(
-                    (at, args.cut.image(frame)) for at, frame in video_frames(path)))
+                seconds: list[float] = []
+                frames, rows = decoded(
+                    _noting(seconds, video_frames(path)), args.cut.image, lacking,
+                    escaped(path.name))
                 yield make_episode(
-                    frames, np.arange(len(frames)) / args.fps if args.fps else seconds,
+                    frames, rows / args.fps if args.fps else np.array(seconds)[rows],
                     task=args.task, seed=number)
 
     print(write_bag(args, episodes(), len(files), lacking))
 
 
-def _find_videos(path: Path, camera: str) -> list[Path]:
-    """Return the videos of a camera in a folder; anything else as it is."""
-    found = sorted((file for file in path.rglob('*') if file.suffix.lower() in VIDEOS),
-                   key=natural)
-    if not found:
-        return [path]
+def _noting(seconds: list[float],
+            frames: Iterable[tuple[float, np.ndarray]]) -> Iterator[np.ndarray]:
+    """Yield the pictures of a video; their times are appended."""
+    for at, frame in frames:
+        seconds.append(at)
+        yield frame
+
+
+def find_files(paths: Iterable[str | Path], patterns: Iterable[str],
+               lacking: 'Lacking') -> list[Path]:
+    """
+    Return the regular files that are given, or lie in folders, in the order of their numbers.
+
+    :param patterns: of names in folders, in small letters.
+    :param lacking: is told of what is no such file, and of links that lead out of a folder.
+    :raises RecordingError: for a folder that holds none.
+    """
+    found = []
+    for path in map(Path, paths):
+        named = [path] if not path.is_dir() else [
+            file for file in path.rglob('*') if not file.is_dir()
+            and any(fnmatch(file.name.lower(), pattern) for pattern in patterns)]
+        if not named:
+            raise RecordingError(f'{escaped(path)}: '
+                                 f'{what_is(path) or "holds no file " + listing(patterns, 20)}')
+        for file in named:
+            with lacking.passing_over('file', escaped(file.name)):
+                if file == path:
+                    regular(file)
+                else:
+                    inside(path, file.relative_to(path))
+                found.append(file)
+    return sorted(found, key=natural)
+
+
+def _of_camera(path: Path, found: list[Path], camera: str) -> list[Path]:
+    """Return the videos of a camera; a file alone as it is."""
+    if not path.is_dir():
+        return found
     names = Counter(file.stem for file in found)
     if not camera and 1 < len(names) < len(found):
         raise ConfigError(f'--camera: expected one of {listing(sorted(names))}, which '
@@ -159,11 +204,16 @@ def decoded(pictures: Iterable[Any], decode: Callable[[Any], np.ndarray], lackin
     :return: the pictures, and which ones they are, (T,).
     :raises ValueError: when there is none.
     """
-    frames, rows = [], []
+    frames, rows, size = [], [], 0
     for row, each in enumerate(pictures):
         with lacking.passing_over('picture', f'{row} of {place}'):
             frames.append(decode(each))
             rows.append(row)
+            size += frames[-1].nbytes
+        if row >= MOST_FRAMES or size > MOST_BYTES:
+            raise RecordingError(
+                f'it is longer than {MOST_FRAMES} pictures or {MOST_BYTES >> 30} GiB; cut it into '
+                'demonstrations, or keep less of each picture (--size)')
     if not frames:
         raise ValueError('none of its pictures can be used')
     return frames, np.array(rows)
@@ -179,8 +229,16 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
     :param object_names: of K objects, whose pixels are known.
     :param known: other fields of Episode; what is left out is unknown, actions are zeros.
     :return: Episode.
+    :raises ValueError: for times and a seed that a recording cannot hold.
     """
     T, K = len(frames), len(object_names)
+    seconds = np.asarray(seconds, float) - seconds[0]
+    if not (np.diff(seconds) > 0).all() or not seconds[-1] < _MOST_SECONDS:
+        raise ValueError('its times are not those of a demonstration: they have to increase, by '
+                         f'less than {_MOST_SECONDS} s')
+    if not 0 <= known.get('seed', 0) < 2**64:
+        raise ValueError(f'its seed {escaped(known["seed"], 30)} is none: 0 to 2^64 - 1')
+    known['task'] = known.get('task', '').encode(errors='replace').decode()[:MOST_CHARACTERS]
     unknown = np.full((T, K, 7), np.nan)
     fields = {
         'actions': np.zeros((T, 4), np.float32), 'grippers': np.full((T, 4), np.nan, np.float32),
@@ -188,7 +246,7 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
         'goal_frame': None, 'goal_pixels': np.full((K, 2), np.nan, np.float32),
         'goal_poses': np.full((K, 7), np.nan), 'object_source': 'imported'}
     return Episode(frames=np.stack(frames), object_names=object_names,
-                   stamps=np.round(np.asarray(seconds) * 1e9).astype(np.int64),
+                   stamps=np.round(seconds * 1e9).astype(np.int64),
                    **(fields | known))
 
 
@@ -240,11 +298,17 @@ def video_frames(path: Path) -> Iterator[tuple[float, np.ndarray]]:
     :return: iterator over (seconds from the first frame, uint8 (H, W, 3) rgb).
     :raises RecordingError: when it is not there, or its codec is unknown.
     """
-    if not path.is_file():
-        raise RecordingError(f'{escaped(path)} is not there')
+    path = regular(path).resolve()  # with no scheme before it, such as cache:
     if why := what_else(path):
         raise RecordingError(f'{escaped(path)}: {why}')
-    capture, last = cv2.VideoCapture(str(path)), -1.0
+    options = {'format_whitelist': _FORMATS, 'protocol_whitelist': 'file'}
+    os.environ['OPENCV_FFMPEG_CAPTURE_OPTIONS'] = '|'.join(map(';'.join, options.items()))
+    capture, last = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG), -1.0
+    width, height = (capture.get(side) for side in (
+        cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width * height * 3 > MAX_PICTURE_BYTES:
+        raise RecordingError(f'{escaped(path)}: {width:.0f}x{height:.0f} pixels are more than '
+                             f'{MAX_PICTURE_BYTES} bytes of rgb; make it smaller')
     good, frame = capture.read()
     if good:
         period = 1 / (capture.get(cv2.CAP_PROP_FPS) or 25)
@@ -261,6 +325,6 @@ def video_frames(path: Path) -> Iterator[tuple[float, np.ndarray]]:
             f'{escaped(path)}: is no video, or OpenCV knows no decoder for it, as for AV1; install'
             ' PyAV (pip install av) if its licence suits you, or make it anew: ffmpeg -i OLD.mp4 '
             '-c:v libvpx-vp9 NEW.mp4') from None
-    with av.open(str(path)) as container:
+    with av.open(str(path), options=options) as container:
         for picture in container.decode(video=0):
             yield float(picture.time), picture.to_ndarray(format='rgb24')

@@ -9,10 +9,11 @@ and the instruction are taken; times are nominal, since records do not tell them
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import count
 import math
+import os
 from pathlib import Path
 import re
 import struct
@@ -28,17 +29,18 @@ from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import (
     decoded,
+    find_files,
     Lacking,
     make_episode,
     Options,
     write_bag,
 )
-from tap_ros.recording.metadata import natural
 from tap_ros.text import escaped, listing
 
 _FILES = b'\xff\xd8\xff', b'\x89PNG'  # JPEG, PNG
 
 FPS = 5.0  # where nobody says another
+_MOST_RECORD = 2**31  # bytes; those of protobuf have fewer
 
 
 def run(args: Options) -> None:
@@ -47,9 +49,10 @@ def run(args: Options) -> None:
 
     :raises TapError: for records that cannot be read, and a folder that holds something.
     """
-    files = [file for path in map(Path, args.paths) for file in (
-        sorted(path.rglob('*.tfrecord*'), key=natural) if path.is_dir() else [path])]
     camera, blank, lacking = args.camera, Counter[bool](), Lacking()
+    files = find_files(args.paths, ('*.tfrecord*',), lacking)
+    for name in _missing(file for file in files if file not in set(map(Path, args.paths))):
+        lacking.note('it is not there; fetch it, then import again', 'file', name)
 
     def episodes() -> Iterator[Episode]:
         nonlocal camera
@@ -75,6 +78,17 @@ def run(args: Options) -> None:
         print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
 
 
+def _missing(files: Iterable[Path]) -> list[str]:
+    """Return the names of files that belong beside those of a folder: NAME-00003-of-00008."""
+    found: dict[tuple[str, str], set[int]] = {}
+    for file in files:
+        if match := re.fullmatch(r'(.+)-(\d{5})-of-(\d{5})', str(file)):
+            found.setdefault((match[1], match[3]), set()).add(int(match[2]))
+    return [f'{escaped(Path(name).name)}-{number:05d}-of-{total}'
+            for (name, total), numbers in found.items()
+            for number in range(int(total)) if number not in numbers]
+
+
 def _choose(features: dict[str, list[bytes]], camera: str) -> str:
     """Return the camera whose pictures are taken, with the number of steps in a batch."""
     names = {match[1] or match[2] for name, value in features.items()
@@ -88,8 +102,9 @@ def _choose(features: dict[str, list[bytes]], camera: str) -> str:
             first[name] = _picture(_pictures(features, name)[0])
     seen = [name for name, picture in first.items() if not _is_blank(picture)]
     if camera or len(seen) > 1 or not first:
-        raise ConfigError(f'--camera: {escaped(camera)}; expected one of '
-                          f'{listing(seen or first) or "those with pictures, but there are none"}')
+        kind = RecordingError if camera or not first else ConfigError  # others may have it
+        raise kind(f'--camera: {escaped(camera)}; expected one of '
+                   f'{listing(seen or first) or "those with pictures, but there are none"}')
     return (seen or list(first))[0]
 
 
@@ -130,7 +145,9 @@ def read_records(path: Path, lacking: Lacking) -> Iterator[tuple[int, bytes]]:
     :return: generator of (number from 0, bytes).
     """
     with lacking.passing_over('file', escaped(path.name)), open(path, 'rb') as stream:
-        number = 0
+        size, number = os.fstat(stream.fileno()).st_size, 0
+        if not size:
+            raise RecordingError('it is empty; fetch the file again')
         while head := stream.read(12):
             with lacking.passing_over('record', f'{number} of {escaped(path.name)}'):
                 if len(head) < 12:
@@ -140,9 +157,13 @@ def read_records(path: Path, lacking: Lacking) -> Iterator[tuple[int, bytes]]:
                     stream.seek(0, 2)  # nothing tells where the next one begins
                     raise RecordingError('it is damaged, or this is no uncompressed TFRecord '
                                          'file; fetch the file again')
-                data, tail = stream.read(length), stream.read(4)
-                if len(data) + len(tail) < length + 4:
+                if length + 4 > size - stream.tell():
+                    stream.seek(0, 2)
                     raise RecordingError('it is cut off; fetch the file again')
+                if length > _MOST_RECORD:
+                    stream.seek(length + 4, 1)
+                    raise RecordingError(f'it has more than {_MOST_RECORD} bytes')
+                data, tail = stream.read(length), stream.read(4)
                 if _masked_crc(data) != int.from_bytes(tail, 'little'):
                     raise RecordingError('it is damaged: its CRC does not match; fetch the file '
                                          'again')
