@@ -204,7 +204,7 @@ class Client:
             of topics are in the order of the message.
         :raises CallError: as call.
         """
-        left = _countdown(self._timeout(timeout_s))  # large pictures take their time
+        left = _countdown('predict', self._timeout(timeout_s))  # encoding large pictures takes long
         fields = request_fields(
             start=start, goal=goal, start_objects=start_pixels, goal_objects=goal_pixels)
         response = self.call(
@@ -274,7 +274,7 @@ class Client:
         :return: the first view of the camera, and the goal.
         :raises CallError: when the simulator refuses, or shows nothing.
         """
-        left = _countdown(self.timeout_s)
+        left = _countdown('reset', self.timeout_s)
         scene: dict[str, Any] = {'task': task, 'seed': seed, 'hide_arm': hide_arm}
         _message(ResetScene.Request, scene)  # raises before anything is waited for
         self._views('goal')  # subscribed before something comes
@@ -435,10 +435,15 @@ def _seconds(value: Any) -> float:
     return min(float(value), FOREVER_S)
 
 
-def _countdown(seconds: float) -> Callable[[], float]:
-    """Return a function that tells how many seconds are left, a millisecond at least."""
+def _countdown(what: str, seconds: float) -> Callable[[], float]:
+    """Return a function that tells how many seconds are left; CallError once there are none."""
     deadline = time.monotonic() + seconds
-    return lambda: max(deadline - time.monotonic(), 1e-3)
+
+    def left() -> float:
+        if (found := deadline - time.monotonic()) <= 0:
+            raise CallError(f'{what}: not done within {seconds:g} s')
+        return found
+    return left
 
 
 def _names(names: Iterable[Any]) -> list[str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import signal
 import subprocess
 import sys
+import threading
 import time
 from typing import Any
 
@@ -272,6 +273,24 @@ def test_predictor_killed(rig, trials):
                 rig.restart('predictor_node')
                 rig.expect_prediction(5.0)
                 rig.begin_moving(**goal_fields('subgoal'))
+
+
+@fault(f'the predictor stands still for {PAUSED_S:g} s during a call', 'the call is answered', 20,
+       's for the call')
+def test_predictor_paused(rig, trials):
+    for _ in trials:
+        rig.need('predictor_node')
+        victim = rig.processes['predictor_node']
+        with trials.one():
+            begin = time.monotonic()
+            victim.send(signal.SIGSTOP)
+            timer = threading.Timer(PAUSED_S, victim.send, [signal.SIGCONT])
+            timer.start()
+            try:
+                rig.expect_prediction(20.0)
+                trials.measured(time.monotonic() - begin)
+            finally:
+                timer.join()
 
 
 def kill_during_goal(rig, trials, victim, expect):

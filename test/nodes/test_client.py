@@ -118,6 +118,15 @@ def test_what_cannot_be_sent_is_said_before_it_is_sent(ask):
         ask(client)
 
 
+def test_a_call_ends_in_time_whatever_takes_long():
+    with tap_ros.Client('/nobody', timeout_s=0.05) as client:
+        large = np.zeros((2000, 2000, 3), np.uint8)
+        with pytest.raises(CallError, match='predict: not done within 0.001 s'):
+            client.predict(large, large, timeout_s=0.001)
+        with pytest.raises(CallError, match='0.05 s'):
+            client.reach(timeout_s=1e300)
+
+
 def test_the_example_of_its_page_runs(loop, capsys):
     page = (Path(__file__).parents[2] / 'docs' / 'python.md').read_text()
     block, = re.findall(r'^```python\n(from tap_ros import Client.*?)^```$', page, re.M | re.S)
