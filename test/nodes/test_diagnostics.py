@@ -44,8 +44,10 @@ def test_what_is_published_instead_and_the_remedy_are_named():
             assert until(fits, 10), (published, why_silent(node, topic, kind))
             assert f'{topic}:={topic}' not in why_silent(node, topic, kind)
             assert until(lambda node=node: node.count_publishers('/a/plan'))
-            there = next(iter(published.items()))
-            assert until(lambda node=node, there=there: why_silent(node, *there) == '')
+            name, other = next(iter(published.items()))
+            assert until(lambda node=node, name=name: {'camera'} == {
+                one.node_name for one in node.get_publishers_info_by_topic(name)})
+            assert why_silent(node, name, other) == ''
             assert not {'/goal/image', '/goal/object', '/a/plan'} & set(
                 why_silent(node, topic, kind).replace(',', ' ').replace(':', ' ').split())
 

@@ -171,6 +171,8 @@ def test_another_scene_or_camera_during_a_goal_aborts_it(loop):
     publisher = loop.node.create_publisher(Image, 'camera/image_raw', STREAM)
     try:
         loop.ended(reaching, 'aborted', '2 nodes publish on /camera/image_raw')
+        result = loop.ended(loop.begin(), 'aborted', '2 nodes publish on /camera/image_raw')
+        assert not result.steps
     finally:
         loop.node.destroy_publisher(publisher)
 

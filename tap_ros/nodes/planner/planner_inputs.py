@@ -58,6 +58,8 @@ class PlannerInputs:
         self._types = {**camera_topics(params), 'joints': of_topic(JOINT_STATES)}
         self.topics = tuple(self._types)
         self._names = [name for _, name in self._types.values()]
+        self._cameras = [name for topic, (_, name) in self._types.items()
+                         if topic in ('image', 'mask')]
         self._tell = on_message
         self.sensors = Observations(*self._types)
         self._gripper = GripperHistory(
@@ -88,6 +90,9 @@ class PlannerInputs:
         if rival:
             raise PlanningError(
                 f'the scene has changed: {rival}; leave one, and send the goal again')
+        cameras = rivals(self._node, self._cameras)
+        if cameras:  # one may have ended just now
+            return None, f'{cameras}; leave one of them'
         topics = self.topics
         moment = self.sensors.newest(*topics, since=self._since)
         lacking = self._lacking(topics)
