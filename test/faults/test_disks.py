@@ -107,6 +107,7 @@ def read_bag(folder):
 
 
 @pytest.mark.ros
+@pytest.mark.errors('cannot be written|No space left')
 @fault('the disk is full while recorder_node records', 'error in log and answer, exit code not 0; '
        'what was recorded can be read', 8)
 def test_disk_full_recorder(trials, rig, tmp_path):

@@ -19,8 +19,6 @@ from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import goal_topics, LATCHED, to_stamp
 from tap_ros.planning.reach import Seen
 
-MASK_TIMEOUT = 0.1  # s that the robot mask of a goal picture may come after it
-
 
 class GoalSource:
     """
@@ -67,7 +65,7 @@ class GoalSource:
             self._stamp = found.stamp_ns
             if 'image' in needed and self._robot.used and not self._newest.missing(['mask']):
                 found = self._newest.wait(
-                    (*needed, 'mask'), MASK_TIMEOUT, self._stamp - 1, give_up) or found
+                    (*needed, 'mask'), timeout_s, self._stamp - 1, give_up) or found
                 mask = found.messages.get('mask')
             # Where it is not needed, it says how large the picture is that the objects are in.
             image = found.messages.get('image', image) if is_empty(image) else image
