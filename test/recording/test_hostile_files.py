@@ -313,6 +313,7 @@ def test_links_that_lead_nowhere_and_in_circles_leave_a_file_usable(tmp_path, ru
     with h5py.File(file, 'a') as opened:
         opened['gone'], opened['away'] = h5py.SoftLink('/no'), h5py.ExternalLink('no.h5', '/')
         opened['data/demo_0/up'] = opened['data']
+        opened[b'\x80'] = np.zeros(3)
     assert len(run('import-arrays', file)[0]) == 1
 
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 from itertools import count
 import math
+import os
 from pathlib import Path
 import re
 from typing import Any
@@ -100,21 +101,22 @@ def _arrays(root: Any, lacking: Lacking,
             budget: Budget) -> Iterator[tuple[str, Callable[[], Iterable[Any]]]]:
     """Yield the arrays of pictures in a file: their paths, and what reads them."""
     import h5py
-    groups, seen = [('', root)], set()
+    groups, seen, place = [('', root)], set(), escaped(Path(root.filename).name)
     while groups:
         above, group = groups.pop()
-        if (place := h5py.h5o.get_info(group.id).addr) in seen:  # groups may hold each other
+        if (address := h5py.h5o.get_info(group.id).addr) in seen:  # groups may hold each other
             continue
-        seen.add(place)
+        seen.add(address)
         for name in set(group) - {'next_obs'}:  # robomimic's observations once more
-            with lacking.passing_over('array', escaped(above + name)):
+            path = above + os.fsdecode(name)
+            with lacking.passing_over('array', f'{escaped(path)} of {place}'):
                 if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                     continue  # to another file, or what is read anyway
                 one = group[name]
                 if isinstance(one, h5py.Group):
-                    groups.append((f'{above}{name}/', one))
+                    groups.append((f'{path}/', one))
                 elif isinstance(one, h5py.Dataset) and _holds_pictures(one):
-                    yield above + name, partial(_read, one, budget)
+                    yield path, partial(_read, one, budget)
 
 
 def _read(array: Any, budget: Budget) -> Iterable[Any]:
