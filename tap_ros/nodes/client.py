@@ -204,7 +204,7 @@ class Client:
             of topics are in the order of the message.
         :raises CallError: as call.
         """
-        left = _countdown('predict', self._timeout(timeout_s))  # encoding large pictures takes long
+        left = _countdown('predict', self._timeout(timeout_s))  # encoding takes its time
         fields = request_fields(
             start=start, goal=goal, start_objects=start_pixels, goal_objects=goal_pixels)
         response = self.call(
@@ -442,7 +442,7 @@ def _countdown(what: str, seconds: float) -> Callable[[], float]:
     def left() -> float:
         if (found := deadline - time.monotonic()) <= 0:
             raise CallError(f'{what}: not done within {seconds:g} s')
-        return found
+        return round(found, 2) or found  # as errors print it
     return left
 
 
