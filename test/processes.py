@@ -25,6 +25,7 @@ from tap_ros.nodes.heartbeat import Heartbeat
 from tap_ros.nodes.node_processes import errors_in
 
 ROOT = Path(__file__).parents[1]
+PATIENCE = 5.0  # a time-out says that a test has failed, not how fast the machine is
 _unread = []  # nodes with a log that was not read to its end
 
 
@@ -43,8 +44,12 @@ def unexpected(log, expected):
 
 
 def until(accept, seconds=30.0, pause=0.02):
-    """Ask until the answer is true; return the last answer."""
-    deadline = time.monotonic() + seconds
+    """
+    Ask until the answer is true; return the last answer.
+
+    :param seconds: after which that has failed on an idle machine; a busy one gets more.
+    """
+    deadline = time.monotonic() + PATIENCE * seconds
     while not (found := accept()) and time.monotonic() < deadline:
         time.sleep(pause)
     return found
