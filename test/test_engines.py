@@ -104,3 +104,16 @@ def test_ray_gives_what_the_pool_gives_also_when_a_node_dies(tmp_path, monkeypat
         ray.shutdown()
         cluster.shutdown()
     assert len(list(tmp_path.glob('*.*'))) > len(list(tmp_path.glob('file?'))) == 4
+
+
+@pytest.mark.parametrize('program, chosen, threads', [
+    ('/any/bin/predictor_node', None, '1'), ('/any/bin/predictor_node', '3', '3'),
+    ('/any/bin/mine', None, 'None')])
+def test_each_of_our_programs_has_one_thread_unless_the_user_chose(program, chosen, threads):
+    variables = {key: value for key, value in os.environ.items() if key != 'OMP_NUM_THREADS'}
+    code = (f'import os, sys; sys.argv = [{program!r}]; import tap_ros; '
+            "print(os.environ.get('OMP_NUM_THREADS'))")
+    said = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, cwd=ROOT,
+        env=variables | ({'OMP_NUM_THREADS': chosen} if chosen else {}))
+    assert said.stdout.strip() == threads, said.stderr
