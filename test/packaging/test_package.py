@@ -145,7 +145,7 @@ def test_pip_brings_what_is_imported_and_the_pinned_versions_will_do(monkeypatch
     described = run_setup('setup.py', stop_after='commandline')
     extras = dict(described.extras_require)
     assert extras.pop('test') == ['pytest']
-    extras = {normalized(each) for extra in extras.values() for each in extra}
+    extras = {normalized(each.partition('>')[0]) for extra in extras.values() for each in extra}
     assert extras == set(requirements('requirements-extras.txt'))
 
     bounds = {normalized(each.name): each.specifier
