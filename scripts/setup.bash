@@ -142,7 +142,9 @@ make_wheels() {
 build_packages() {
   . scripts/environment.bash
   rm -rf build/tap_ros  # setuptools refuses where a file is gone that was there before
-  step 'packages tap_msgs and tap_ros' colcon build --symlink-install --base-paths . tap_msgs
+  # By default colcon has make wait until the machine is idle, which a busy one never is.
+  step 'packages tap_msgs and tap_ros' env MAKEFLAGS="-j$(nproc)" \
+    colcon build --symlink-install --base-paths . tap_msgs
   . scripts/environment.bash  # now with what was built
   # Where an environment forbids writing bytecode, each process would compile torch anew.
   step 'bytecode' env -u PYTHONDONTWRITEBYTECODE python -c '
