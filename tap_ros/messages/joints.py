@@ -27,7 +27,7 @@ MOST = 10_000  # states kept of a joint
 FARTHEST = 100.0  # rad or m; no joint is there
 _FASTEST, _AT_ZERO = 10.0, 1.0  # rad/s or m/s: there and back; likewise where it is 0 to the bit
 _JUMP = 0.05  # rad or m: less is no jump
-_BRIEF = 1.0  # s; who is elsewhere for longer is there
+_BRIEF, _BRIEF_AT_ZERO = 0.3, 1.0  # s; what is elsewhere for longer is there
 
 
 def decode_positions(message: Any) -> dict[str, float]:
@@ -110,7 +110,8 @@ def contradicted(times: np.ndarray, values: np.ndarray) -> np.ndarray:
         begins, ends = np.append(0, edges), np.append(edges, len(x))  # of the parts between jumps
         before, after = np.maximum(begins - 1, 0), np.minimum(ends, len(x) - 1)
         least = np.minimum(np.abs(x[begins] - x[before]), np.abs(x[ends - 1] - x[after]))
-        brief = (t[after] - t[before] < _BRIEF) & (np.abs(x[after] - x[before]) <= least / 2)
+        brief = (np.abs(x[after] - x[before]) <= least / 2) & (
+            t[after] - t[before] < (_BRIEF_AT_ZERO if zeros else _BRIEF))
         counts = ends - begins
         if zeros:
             # What is before the first jump, or behind the last, is not back: it has to be large.

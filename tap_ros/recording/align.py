@@ -134,6 +134,8 @@ class _Clock:
         """
         times, rows = self._around(track)
         columns, wrong = [], np.zeros(len(track), bool)
+        if len(times) and np.isin(times, self.times).mean() > 0.5:
+            places = 0  # who tells of each frame tells of nothing else
         for k, column in enumerate(values[rows].T):
             told = np.isfinite(column)
             if k < places:
