@@ -236,6 +236,7 @@ def test_an_object_that_is_unsure_and_seen_again_is_told_of_once(client, capfd):
     assert not [line for line in lines if 'Traceback' in line or '[ERROR]' in line]
 
 
+@pytest.mark.errors('following: ')
 def test_what_cannot_be_followed_costs_one_picture(client):
     with Eye(client, 'costly') as eye:
         eye.picture(1)
