@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nodes as one plain class: arrays in, arrays out, no rclpy to know."""
 
+import atexit
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
@@ -121,6 +122,7 @@ class Client:
         self.answers = self._group if self._context is None else self._spinner.answers
         self._lock = threading.RLock()
         self._made: dict[str, Any] = {}  # what was asked for so far
+        atexit.register(self.close)  # a goal has an owner, and threads end before Python does
 
     def __enter__(self) -> Self:
         return self
@@ -129,7 +131,8 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """End; a goal in progress is cancelled."""
+        """End, at the latest when Python does; a goal in progress is cancelled."""
+        atexit.unregister(self.close)
         if 'goals' in self._made:
             self._made['goals'].close()
         if self._context is not None:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Goals of reach_goal: sent with an id of our own, and cancelled by it whoever gives up."""
 
-import atexit
 from collections.abc import Callable, Iterator
 from concurrent import futures
 from contextlib import suppress
@@ -38,8 +37,7 @@ class Goals:
     The goals that a node has sent: none is left without an owner.
 
     What is given up is cancelled by its id, again and again until the planner has answered, in a
-    thread of its own. All that have not ended are given up by close, at the latest when Python
-    ends.
+    thread of its own. All that have not ended are given up by close.
 
     :param node: rclpy Node that another thread spins.
     :param server: Liveness of the planner.
@@ -57,7 +55,6 @@ class Goals:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name='cancelling', daemon=True)
         self._thread.start()
-        atexit.register(self.close)
 
     def new_id(self) -> bytes:
         """Return the id of a goal; the planner watches whom its first bytes name."""
@@ -88,7 +85,6 @@ class Goals:
 
     def close(self) -> None:
         """Cancel what has not ended; wait until that was answered or the planner is gone."""
-        atexit.unregister(self.close)
         with self._changed:
             goals = list(self._open)
         for goal in goals:

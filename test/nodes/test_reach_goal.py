@@ -222,7 +222,9 @@ def test_a_goal_ends_with_its_client(loop, end, why):
     planner = loop.processes['visual_mpc_node']
     log_bytes = len(planner.text)
     with loop.set(goal_tolerance=0.01):  # it is never reached
-        subprocess.run([sys.executable, '-c', f'{CLIENT}    {end}'], timeout=120)
+        client = subprocess.run([sys.executable, '-c', f'{CLIENT}    {end}'], timeout=120,
+                                stderr=subprocess.PIPE, text=True)
+        assert 'terminate called' not in client.stderr
         assert until(lambda: 'reach_goal ended after' in planner.text[log_bytes:], 60)
     assert why in planner.text[log_bytes:] and len(loop.moves()) and loop.stopped()
     served(loop)
