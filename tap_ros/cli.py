@@ -43,7 +43,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'mark': ('mark the bottleneck in a few demonstrations, on a page in the browser',
              'tap_ros.prediction.mark_command'),
     'train': ('train on recordings', {
-        'predictor': ('train a subgoal predictor', 'tap_ros.evaluation.choose'),
+        'predictor': ('train a subgoal predictor', 'tap_ros.prediction.training_config'),
         'forward': ("train the planner's forward model",
                     'tap_ros.planning.forward_training_config'),
     }),
