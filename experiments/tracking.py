@@ -32,8 +32,7 @@ SIZE, SMALL = 256, 64
 OFF = 1.35  # px of 64 that a person's clicks are off
 # Look, size (0: SIZE), clicks and tracker of a column of the page.
 COLUMNS = {'UR10e, exact': ('arm', 0, 0.0, 'rigid'), 'UR10e, clicks off': ('arm', 0, OFF, 'rigid'),
-           'UR10e, 64 px': ('arm', SMALL, 0.0, 'rigid'), 'hand, exact': ('hand', 0, 0.0, 'rigid'),
-           'hand, `carried`': ('hand', 0, 0.0, 'carried')}
+           'UR10e, 64 px': ('arm', SMALL, 0.0, 'rigid'), 'hand, exact': ('hand', 0, 0.0, 'rigid')}
 LINES = {
     'median_px': 'median error, px', 'within_2px': 'right: within 2 px',
     'wrong_sure': 'wrong by 3 px and said to be seen', 'lost': 'objects lost at the end',

@@ -23,7 +23,7 @@ class Options:
     :param tasks: what is pushed or stacked.
     :param methods: what is compared, see experiments/planning/methods.py: direct, shipped, the
         names of predictors of the command paper, or your own; with options behind colons: half,
-        recursion<n>, rounds<n>, samples<n>, carried, tracked, true_model, twice, steps<n>. By
+        recursion<n>, rounds<n>, samples<n>, tracked, true_model, twice, steps<n>. By
         default the usual ones of each task, stacking only with weights that are there.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.

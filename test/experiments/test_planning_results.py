@@ -114,7 +114,7 @@ def test_results_of_other_settings_are_not_subtracted():
         assert not any('against' in row for row in make_rows(results))
     results = dict([stored('direct', [9.0]), stored('direct:steps60', [4.0])])
     assert {r['compares'] for r in make_rows(results) if 'against' in r} == {'step_budget'}
-    results = dict([stored('genmin', [9.0]), stored('genmin:carried', [4.0])])
+    results = dict([stored('genmin', [9.0]), stored('genmin:tracked', [4.0])])
     assert any('against' in row for row in make_rows(results))
     results['push2', 'genmin'][0]['predictor_weights'] = 'others'
     assert not any('against' in row for row in make_rows(results))
@@ -125,18 +125,18 @@ def test_the_command_leaves_numbers_and_films_and_runs_nothing_again(
     monkeypatch.setattr(runs, 'run_tasks', run_here)
     out = tmp_path / 'results'
     words = ['evaluate', 'planning', '--tasks', 'push2', 'stack2', '--methods', 'nothing',
-             'direct:steps2', 'shipped:carried:steps2', '--scenes', '1',
+             'direct:steps2', 'shipped:tracked:steps2', '--scenes', '1',
              '--out', str(out), '--preset', 'quick', '--solver', 'icem']
     assert main(words) == 0
     rows = json.loads((out / 'planning.json').read_text())
     assert {row['method'] for row in rows} == {
-        'nothing', 'direct:steps2', 'shipped:carried:steps2'}
-    carried = [row for row in rows if row['method'] == 'shipped:carried:steps2']
-    assert {row['step_budget'] for row in carried} == {2}
-    assert {row['tracking'] for row in carried} == {'carried'}
-    assert 'tracking_error_px' in {row['metric'] for row in carried}
-    assert '--methods shipped:carried:steps2 --scenes 1' in carried[0]['command']
-    assert '--solver icem' in carried[0]['command']
+        'nothing', 'direct:steps2', 'shipped:tracked:steps2'}
+    tracked = [row for row in rows if row['method'] == 'shipped:tracked:steps2']
+    assert {row['step_budget'] for row in tracked} == {2}
+    assert {row['tracking'] for row in tracked} == {'rigid'}
+    assert 'tracking_error_px' in {row['metric'] for row in tracked}
+    assert '--methods shipped:tracked:steps2 --scenes 1' in tracked[0]['command']
+    assert '--solver icem' in tracked[0]['command']
     for film in ('planning/push2-direct--steps2.png', 'stacking/stack2-direct--steps2.png'):
         assert (out / film).read_bytes().startswith(b'\x89PNG')
     files = {path: path.stat().st_mtime_ns for path in out.rglob('*-*.json')}
