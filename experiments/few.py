@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The command `python -m tap_ros few`: what a predictor learns from few demonstrations.
+The command `python -m experiments few`: what a predictor learns from few demonstrations.
 
 A curve over their number in a task of Meta-World, and real ones in folds: each demonstration is
 scored by a predictor that has not seen it, nor was stopped by it.
@@ -68,7 +68,7 @@ class Options:
     seeds: int = 1
     bags: Folder = 'bags/few'
     runs: Folder = 'runs/few'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
 
 
 def run(args):

@@ -36,7 +36,7 @@ class Places:
 
     recordings: Folder = 'bags'
     runs: Folder = 'runs/paper'
-    results: Folder = 'docs/results'
+    results: Folder = 'runs/results'
 
     def recording(self, name):
         """Return the Path of a recording."""

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line of Table 2 and of stacking: python -m tap_ros evaluate planning."""
+"""The command line of Table 2 and of stacking: python -m experiments planning."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -52,7 +52,7 @@ class Options:
     solver: Annotated[str, one_of(names('tap_ros.solvers'))] = 'cem'
     forward_weights: ShippedFile = str(FORWARD_MODEL)
     device: str = 'cpu'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
     no_films: Flag = False
     results_only: Flag = False
 

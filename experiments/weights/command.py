@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `python -m tap_ros weights`: make the shipped predictors again by their recipes."""
+"""The command `python -m experiments weights`: make the shipped predictors by their recipes."""
 
 from dataclasses import dataclass
 from pathlib import Path

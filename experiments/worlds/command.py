@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The command `python -m tap_ros worlds`: who finds the bottleneck in demonstrations of others.
+The command `python -m experiments worlds`: who finds the bottleneck in demonstrations of others.
 
 Demonstrations of other simulators, keyframes of them, and predictors trained on them.
 """
@@ -74,7 +74,7 @@ class Options:
     seeds: int = 3
     bags: Folder = 'bags/worlds'
     runs: Folder = 'runs/worlds'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
     results_only: Flag = False
     engine: Engine = Engine()
 

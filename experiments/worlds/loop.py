@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The command `python -m tap_ros worlds-loop`: a closed loop that another world judges.
+The command `python -m experiments worlds-loop`: a closed loop that another world judges.
 
 Bags of pushes in Meta-World, a forward model and predictors from them, and the loop of the nodes,
 planning/reach.py, in fresh scenes. What counts is the environment's own signal.
@@ -80,7 +80,7 @@ class Options:
     scenes: int = 50
     bags: Folder = 'bags/loop'
     runs: Folder = 'runs/loop'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
     results_only: Flag = False
     engine: Engine = Engine()
 
