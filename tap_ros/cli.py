@@ -42,9 +42,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'mark': ('mark the bottleneck in a few demonstrations, on a page in the browser',
              'tap_ros.prediction.mark_command'),
     'train': ('train on recordings', {
-        'predictor': ('train a subgoal predictor', 'tap_ros.prediction.training_config'),
-        'forward': ("train the planner's forward model",
-                    'tap_ros.planning.forward_training_config'),
+        'predictor': ('train a subgoal predictor', 'tap_ros.apps.train:predictor'),
+        'forward': ("train the planner's forward model", 'tap_ros.apps.train:forward'),
     }),
     'evaluate': ('score trained weights or a tracker', {
         'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.command:prediction'),
@@ -136,7 +135,7 @@ def read(arguments: Sequence[str], line: CommandLine = TAP_ROS) -> tuple[Run, An
     # What is completed is a name that a shell can look up, not three words.
     options = parse(reduce(or_, kinds), words, line.prog.split()[-1] if completion else line.prog,
                     line.summary)
-    again = getattr(sys.modules[type(options).__module__], 'defaults', None)
+    again = getattr(sys.modules[runs[type(options)].__module__], 'defaults', None)
     if again:  # what is left out depends on what was said
         options = parse(type(options), words[2:], f'{line.prog} {words[0]} {words[1]}',
                         default=again(options))

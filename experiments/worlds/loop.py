@@ -21,6 +21,7 @@ import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.gym_pushes import push_to_goal
 from sim_bridge.world_protocol import make_world
+from tap_ros.apps.train import train
 from tap_ros.contract import ACTION_LIMIT, step_budget
 from tap_ros.engines import Engine
 from tap_ros.errors import SceneError
@@ -34,7 +35,6 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
-from tap_ros.training.train import train
 from tqdm import tqdm
 
 WORLD, IMAGE_SIZE = 'metaworld', 64
