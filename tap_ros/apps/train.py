@@ -49,19 +49,18 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
         raise ConfigError(f'model {model!r} is unknown; valid: {", ".join(RECIPES)}')
     usual = next(iter(RECIPES[model].values()))
     known = [field.name for field in fields(usual)]
-    for name, value in settings.items():
+    for name in settings:
         if name not in known:
             near = get_close_matches(name, known, 1)
             raise ConfigError(f'setting {name!r} of a {model} is unknown'
                               + (f'; did you mean {near[0]!r}?' if near else ''))
-        if name in ('held_out', 'image_topic') and isinstance(value, str | Path):
-            settings[name] = (str(value),) if value else ()
+    settings |= {'recordings': recordings, **({'out': out} if out else {})}
+    for name, value in settings.items():
+        if name in ('recordings', 'held_out', 'image_topic'):
+            several = [value] if isinstance(value, str | Path) else value
+            settings[name] = tuple(str(each) for each in several if str(each))
         elif isinstance(value, Path):
             settings[name] = str(value)
-    paths = [recordings] if isinstance(recordings, str | Path) else recordings
-    settings['recordings'] = tuple(str(path) for path in paths)
-    if out:
-        settings['out'] = str(out)
     chosen = defaults(replace(usual, recipe=recipe, **settings))
     return Path(_train(replace(chosen, **settings)))
 

@@ -180,7 +180,7 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
         raise WeightsError(f'{escaped(path)}: is a checkpoint of something else '
                            f'({escaped(error)}); {_REMEDY}') from error
     state.step, state.seconds = about['step'], about['seconds']
-    state.precision = about.get('precision', '')
+    state.precision = about['precision']
     state.best_score, state.best_step = about.get('best', (math.inf, 0))
 
 

@@ -24,7 +24,7 @@ from tap_ros.recording.bags import check_first_picture, find_bags
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import reading_of
 from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
-from tap_ros.training.devices import device_name, pick_device
+from tap_ros.training.devices import pick_device
 from tap_ros.training.inpainted import with_masks
 from tap_ros.training.run_config import RunConfig
 from tap_ros.training.split import split_episodes, warn_if_few
@@ -203,7 +203,8 @@ class Run:
             'camera_size': list(store.camera_size) if store.camera_size else None,
             'episodes': len(self.training), 'held_out': len(self.held_out),
             'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, '
-                       f'{device_name(self.device)}',
+                       + (torch.cuda.get_device_name(self.device)
+                          if self.device.type == 'cuda' else self.device.type),
             'torch': torch.__version__, 'python': platform.python_version(), **self.about}
         settings = asdict(config)
         for name, values in (('config', settings), ('run', about), ('scores', scores)):
