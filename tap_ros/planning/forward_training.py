@@ -140,7 +140,8 @@ def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarr
             set((rng.permutation(length)[:config.pictures] + 1).tolist()))
 
 
-def _score(run: Run, episodes: Episodes) -> tuple[Mapping[str, float], Mapping[str, np.ndarray]]:
+def _score(run: Run[ForwardTrainingConfig], episodes: Episodes,
+           ) -> tuple[Mapping[str, float], Mapping[str, np.ndarray]]:
     """Score the averaged model; show some windows of all."""
     model, parts = run.state.average, {'training': run.training, 'held_out': run.held_out}
     return held_out_scores(model, episodes, run.held_out), {

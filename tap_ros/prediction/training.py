@@ -63,19 +63,23 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
         if config.patience and not len(run.held_out):
             raise ConfigError('patience: nothing is held out to see improvement by; give '
                               '--held-out, a --test-fraction above 0, or leave --patience out')
-        network, helpers = make_networks(run, config)
+        network, helpers = make_networks(run)
         state = run.begin(network, AVERAGE_DECAY, helpers)
         state.precision = state.precision or pick_precision(config.precision, run.device)
         networks = Networks(state.network, **dict[str, Any](state.helpers.items()),
                             autocast=make_autocast(state.precision, run.device))
         judges = [judge for judge in (networks.discriminator, networks.posterior_discriminator)
                   if judge is not None]
-        pictures = gather_pictures(run, config)
+        # Decoding and copying would be most of the time of a step on a GPU.
+        make_frames = (partial(ResidentFrames, device=run.device, progress=progress)
+                       if run.device.type == 'cuda' else MappedFrames)
+        preference, run.about = episode_preferences(run.store, config, run.training)
+        pictures = Pictures(make_frames(run.store), fill(
+            run.store, config.robot_mask, make_frames, progress), preference)
         draw = partial(draw_batch, run.store, run.training, config, pictures)
         state.network.train()
         state.helpers.train()
-        for step, batch in run.steps(draw, partial(_score, run, config, pictures),
-                                     config.patience):
+        for step, batch in run.steps(draw, partial(_score, run, pictures), config.patience):
             batch = batch.to(run.device)
 
             # Eqs. 1 to 10: the predictor, and the recognition network.
@@ -102,9 +106,10 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
     return run.weights
 
 
-def make_networks(run: Run, config: TrainingConfig,
+def make_networks(run: Run[TrainingConfig],
                   ) -> tuple[PredictorNetwork, dict[str, torch.nn.Module]]:
     """Make the network, and those that the method needs for its training alone."""
+    config = run.config
     check_trainable(run.store.image_size, 'the predictor')
     vae, longest = config.latent == 'vae', int(run.store.lengths.max())
     shape = PredictorConfig(
@@ -129,17 +134,6 @@ def make_networks(run: Run, config: TrainingConfig,
     if config.gan and vae:
         helpers['posterior_discriminator'] = Discriminator(shape, longest - 1)
     return network, helpers
-
-
-def gather_pictures(run: Run, config: TrainingConfig) -> Pictures:
-    """Say where the pictures of a run come from, and which of them count how much."""
-    # Decoding and copying would be most of the time of a step on a GPU.
-    make_frames = (partial(ResidentFrames, device=run.device, progress=run.progress)
-                   if run.device.type == 'cuda' else MappedFrames)
-    frames = make_frames(run.store)
-    filled = fill(run.store, config.robot_mask, make_frames, run.progress)
-    preference, run.about = episode_preferences(run.store, config, run.training)
-    return Pictures(frames, filled, preference)
 
 
 def sampling_of(config: TrainingConfig) -> Sampling:
@@ -170,10 +164,10 @@ def _values(outcome: Outcome, batch: Batch) -> dict[str, torch.Tensor]:
             **({} if outcome.nats is None else {'nats': outcome.nats})}
 
 
-def _score(run: Run, config: TrainingConfig, pictures: Pictures,
+def _score(run: Run[TrainingConfig], pictures: Pictures,
            ) -> tuple[Mapping[str, float], Mapping[str, np.ndarray]]:
     """Score the averaged network, z at 0, where its method matches; show some of all."""
-    held_out, network = run.held_out, run.state.average
+    config, held_out, network = run.config, run.held_out, run.state.average
     autocast = make_autocast(run.state.precision, run.device)
     sampling = Sampling(
         config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',

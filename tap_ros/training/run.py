@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from typing import Any, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from tap_ros.errors import RecordingError
@@ -35,11 +35,12 @@ from tqdm import tqdm
 
 Trained = TypeVar('Trained', bound=torch.nn.Module)
 Item = TypeVar('Item')  # what a step takes
+Config = TypeVar('Config', bound=RunConfig)
 # Scores by name, and pictures (H, W, 3).
 Score = Callable[[], tuple[Mapping[str, float], Mapping[str, np.ndarray]]]
 
 
-class Run:
+class Run(Generic[Config]):
     """
     A training, or the rest of one that was interrupted.
 
@@ -68,7 +69,7 @@ class Run:
         stays; the run goes on from there.
     """
 
-    def __init__(self, config: RunConfig, kind: str, min_frames: int = 3,
+    def __init__(self, config: Config, kind: str, min_frames: int = 3,
                  stop_at: int | None = None, progress: bool = True,
                  after_step: Callable[[int], object] | None = None) -> None:
         config.check()
