@@ -56,16 +56,16 @@ test-all: build
 	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) $(ARGS)
 
 paper: build
-	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(ARGS)
+	@$(ENTER); python -m experiments paper --jobs $(or $(JOBS),2) --results docs/results $(ARGS)
 
 worlds: build
-	@$(ENTER); python -m tap_ros worlds --jobs $(or $(JOBS),2) $(ARGS)
+	@$(ENTER); python -m experiments worlds --jobs $(or $(JOBS),2) --out docs/results $(ARGS)
 
 faults: build
 	@$(ENTER); $(DOMAIN); python -m pytest -m fault --share 1 --report docs/results test/faults $(ARGS)
 
 bench: build
-	@$(ENTER); $(DOMAIN); python -m tap_ros bench $(or $(ARGS),all)
+	@$(ENTER); $(DOMAIN); python -m experiments bench $(or $(ARGS),all)
 
 lint: build
 	@$(ENTER); ruff check . && mypy

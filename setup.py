@@ -39,7 +39,7 @@ setup(
     python_requires='>=3.11',
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
     package_data={
-        NAME: ['*.pyi', 'evaluation/*.html', 'nodes/demo/*.html', 'nodes/explorer/page/*',
+        NAME: ['*.pyi', 'nodes/demo/*.html', 'nodes/explorer/page/*',
                'nodes/*.xml', 'prediction/page/*', 'py.typed', 'weights/*.md', 'weights/*.png',
                'weights/*.safetensors'],
         'sim_bridge': ['py.typed']},

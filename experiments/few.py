@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The command `python -m tap_ros few`: what a predictor learns from few demonstrations.
+The command `python -m experiments few`: what a predictor learns from few demonstrations.
 
 A curve over their number in a task of Meta-World, and real ones in folds: each demonstration is
 scored by a predictor that has not seen it, nor was stopped by it.
@@ -18,6 +18,7 @@ from experiments.worlds.command import read
 from experiments.worlds.trained import held_out_of, mark, MARKED, marks_of
 import numpy as np
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
+from tap_ros.apps.train import train
 from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import against_copying, mean_interval
@@ -30,7 +31,6 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats import pictures
 from tap_ros.recording.formats.pictures import natural
 from tap_ros.recording.marks import read_marks
-from tap_ros.training.train import train
 import torch
 
 HELD_OUT = 40  # demonstrations in Meta-World
@@ -68,7 +68,7 @@ class Options:
     seeds: int = 1
     bags: Folder = 'bags/few'
     runs: Folder = 'runs/few'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
 
 
 def run(args):

@@ -3,7 +3,7 @@
 """
 Measure the tracker on simulated scenes and real films, and write docs/results/tracking.md.
 
-    python -m experiments.tracking --real FOLDER
+    python -m experiments tracking --real FOLDER
 
 The scenes are others than those on which thresholds and confidence were fitted (seeds 9000 to
 9006 and from 1005000). What stands in the data file is kept; remove the file to measure anew.
@@ -12,7 +12,6 @@ The scenes are others than those on which thresholds and confidence were fitted 
 from dataclasses import dataclass
 import json
 from pathlib import Path
-import sys
 
 from experiments.pages import render, share
 from experiments.tables import find, number
@@ -23,7 +22,7 @@ from tap_ros.evaluation.command import Tracking
 from tap_ros.evaluation.tracking import draw, score
 from tap_ros.files import write_atomically, write_rows
 from tap_ros.images.drawing import png_bytes
-from tap_ros.options import Folder, parse
+from tap_ros.options import Folder
 
 SEED = 88_000
 TASKS = ('push2', 'push3', 'order2')
@@ -32,8 +31,7 @@ SIZE, SMALL = 256, 64
 OFF = 1.35  # px of 64 that a person's clicks are off
 # Look, size (0: SIZE), clicks and tracker of a column of the page.
 COLUMNS = {'UR10e, exact': ('arm', 0, 0.0, 'rigid'), 'UR10e, clicks off': ('arm', 0, OFF, 'rigid'),
-           'UR10e, 64 px': ('arm', SMALL, 0.0, 'rigid'), 'hand, exact': ('hand', 0, 0.0, 'rigid'),
-           'hand, `carried`': ('hand', 0, 0.0, 'carried')}
+           'UR10e, 64 px': ('arm', SMALL, 0.0, 'rigid'), 'hand, exact': ('hand', 0, 0.0, 'rigid')}
 LINES = {
     'median_px': 'median error, px', 'within_2px': 'right: within 2 px',
     'wrong_sure': 'wrong by 3 px and said to be seen', 'lost': 'objects lost at the end',
@@ -59,7 +57,7 @@ class Options:
 
     real: Folder = ''
     bags: Folder = 'bags/tracking'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
 
 
 def run(args):
@@ -170,7 +168,7 @@ def loop(folder):
         'blocked': sum(scene['blocked'] > 0 for mine in scenes for scene in mine.values()),
         'repeated': sum(scene['blocked'] > 2 for mine in scenes for scene in mine.values()),
         'only_tracked': beside.count((True, False)), 'only_true': beside.count((False, True)),
-        'command': 'python -m tap_ros evaluate planning --tasks push2 --methods '
+        'command': 'python -m experiments planning --tasks push2 --methods '
                    f'{" ".join(METHODS)} --scenes {len(true)} --no-films '
                    '--out docs/results/tracking'}
 
@@ -181,7 +179,3 @@ def film_table(rows):
     return pd.DataFrame([{'film': film} | {metric.replace('_', ' '): round(float(
         mine[mine.metric == metric].value.iloc[0]), 2) for metric in some}
         for film, mine in rows.groupby('recording')])
-
-
-if __name__ == '__main__':
-    sys.exit(run(parse(Options, sys.argv[1:], 'python -m experiments.tracking')))

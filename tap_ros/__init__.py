@@ -64,7 +64,7 @@ _EXPORTS = {
     'Solver': 'tap_ros.planning.protocols',
     'SubgoalPredictor': 'tap_ros.prediction.predictor',
     'TapError': 'tap_ros.errors',
-    'train': 'tap_ros.training.train',
+    'train': 'tap_ros.apps.train',
     'VisualMPC': 'tap_ros.planning.visual_mpc',
     'World': 'sim_bridge.world_protocol',
 }

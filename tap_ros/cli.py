@@ -1,26 +1,25 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The command line: collect recordings, train, evaluate, show, measure.
+The command line: collect recordings, train, evaluate, show.
 
 A command is a module with Options, a dataclass, and run(options), beside what it is about; it is
 imported only when asked for, so that one command needs no ROS and another no simulator.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 import importlib
 from operator import or_
 import os
-from pathlib import Path
 import signal
 import sys
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 import warnings
 
 from tap_ros import leave_at_once
-from tap_ros.errors import ConfigError, TapError
+from tap_ros.errors import TapError
 from tap_ros.options import parse
 from tap_ros.text import escaped
 from tyro import conf
@@ -43,47 +42,38 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'mark': ('mark the bottleneck in a few demonstrations, on a page in the browser',
              'tap_ros.prediction.mark_command'),
     'train': ('train on recordings', {
-        'predictor': ('train a subgoal predictor', 'tap_ros.evaluation.choose'),
-        'forward': ("train the planner's forward model",
-                    'tap_ros.planning.forward_training_config'),
+        'predictor': ('train a subgoal predictor', 'tap_ros.apps.train:predictor'),
+        'forward': ("train the planner's forward model", 'tap_ros.apps.train:forward'),
     }),
-    'evaluate': ('score trained weights, a planner or a tracker', {
+    'evaluate': ('score trained weights or a tracker', {
         'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.command:prediction'),
         'forward': ('score a forward model on recordings', 'tap_ros.evaluation.command:forward'),
         'tracking': ('score what follows objects on recordings or films',
                      'tap_ros.evaluation.command:tracking'),
-        'planning': ('push or stack objects and score where they end (Table 2)',
-                     'experiments.planning.command'),
     }),
     'predict': ('predict subgoals from picture files', 'tap_ros.prediction.predict_command'),
     'call': ('ask a running predictor node', 'tap_ros.nodes.call_command'),
-    'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
-    'worlds': ("collect other simulators' demonstrations and score who finds their bottlenecks",
-               'experiments.worlds.command'),
-    'worlds-loop': ("push in another simulator's scenes, by models trained there",
-                    'experiments.worlds.loop'),
-    'few': ('score what predictors learn from few demonstrations, simulated and real',
-            'experiments.few'),
-    'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo.command'),
     'explore': ('see and try all nodes on a page in the browser',
                 'tap_ros.nodes.explorer.command'),
-    'bench': ('measure speed', {
-        'collect': ('speed of collecting', 'experiments.bench.collect'),
-        'recording': ('speed of reading recordings', 'experiments.bench.recording'),
-        'training': ('speed of training the predictor', 'experiments.bench.training'),
-        'planning': ('time of a plan', 'experiments.bench.planning'),
-        'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
-        'all': ('one after the other, into a file', 'experiments.bench.everything'),
-    }),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }
 EXTRAS = {  # what only some commands need, and what pip calls it
     'google': 'google-crc32c protobuf', 'google_crc32c': 'google-crc32c protobuf',
-    'h5py': 'h5py', 'pandas': 'pandas', 'pyarrow': 'pyarrow', 'ray': 'ray',
+    'h5py': 'h5py', 'pyarrow': 'pyarrow', 'ray': 'ray',
     'websockets': 'websockets'}
-PROG = 'python -m tap_ros'
+
+
+class CommandLine(NamedTuple):
+    """What is called how; commands as in COMMANDS."""
+
+    prog: str
+    summary: str
+    commands: Mapping[str, tuple[str, Module]]
+
+
+TAP_ROS = CommandLine('python -m tap_ros', (__doc__ or '').split('\n')[1], COMMANDS)
 
 
 @dataclass(frozen=True)
@@ -91,18 +81,19 @@ class Unread:
     """Options of a command that was not asked for."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, line: CommandLine = TAP_ROS) -> int:
     """
     Run one command.
 
     :param arguments: list of strings; by default those of the process.
+    :param line: CommandLine that they are of.
     :return: exit code: 0, 1 after an error that was named, 130 when interrupted.
     :raises SystemExit: as options.parse, for words that are no command or option and for --help.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     warnings.formatwarning = lambda message, *_, **__: f'warning: {message}\n'
     try:
-        run, options = read(arguments)
+        run, options = read(arguments, line)
         if signal.getsignal(signal.SIGINT) is leave_at_once:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         return run(options) or 0
@@ -128,11 +119,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
-def read(arguments: Sequence[str]) -> tuple[Run, Any]:
+def read(arguments: Sequence[str], line: CommandLine = TAP_ROS) -> tuple[Run, Any]:
     """
     Find out which command is asked for.
 
-    :param arguments: list of strings.
+    :param arguments: list of strings; line: as in main.
     :return: its function, and the options to call it with.
     :raises SystemExit: as options.parse.
     """
@@ -140,13 +131,13 @@ def read(arguments: Sequence[str]) -> tuple[Run, Any]:
     completion = bool(words) and words[0].startswith('--tyro-')
     runs: dict[Any, Run] = {}
     kinds = [_command(name, *about, None if completion else words, runs)
-             for name, about in COMMANDS.items()]
+             for name, about in line.commands.items()]
     # What is completed is a name that a shell can look up, not three words.
-    options = parse(reduce(or_, kinds), words, 'tap_ros' if completion else PROG,
-                    (__doc__ or '').split('\n')[1])
-    again = getattr(sys.modules[type(options).__module__], 'defaults', None)
+    options = parse(reduce(or_, kinds), words, line.prog.split()[-1] if completion else line.prog,
+                    line.summary)
+    again = getattr(sys.modules[runs[type(options)].__module__], 'defaults', None)
     if again:  # what is left out depends on what was said
-        options = parse(type(options), words[2:], f'{PROG} {words[0]} {words[1]}',
+        options = parse(type(options), words[2:], f'{line.prog} {words[0]} {words[1]}',
                         default=again(options))
     return runs[type(options)], options
 
@@ -175,24 +166,12 @@ def _command(name: str, summary: str, module: Module, words: list[str] | None,
 def _load(name: str, runs: dict[Any, Run], needed: bool = True) -> Any:
     """Import a module of COMMANDS; return the type of its options: Options, or as FUNCTION."""
     try:
-        if name.startswith('experiments.'):
-            _find_experiments()
         place, _, word = name.partition(':')
         module = importlib.import_module(place)
-    except (ConfigError, ImportError):
+    except ImportError:
         if needed:
             raise
-        return Unread  # without ROS or a checkout it completes what there is
+        return Unread  # without ROS it completes what there is
     kind = getattr(module, word.title() or 'Options')
     runs[kind] = getattr(module, word or 'run')
     return kind
-
-
-def _find_experiments() -> None:
-    """Let experiments/ be imported, which is beside this package and not installed with it."""
-    checkout = Path(__file__).resolve().parents[1]
-    if not (checkout / 'experiments').is_dir():
-        raise ConfigError('this command is not installed with the package; run it in a checkout '
-                          'of its repository, after `make build`')
-    if str(checkout) not in sys.path:
-        sys.path.append(str(checkout))

@@ -40,7 +40,7 @@ def test_shipped_weights_say_what_they_are(path, capsys):
     assert main(['inspect', str(path)]) == 0
     assert 'data_hash' in capsys.readouterr().out
     card = path.with_suffix('.md').read_text()
-    assert 'python -m tap_ros train' in card or 'python -m tap_ros paper' in card
+    assert 'python -m tap_ros train' in card or 'python -m experiments paper' in card
     assert 'python -m tap_ros collect' in card and path.name in card
 
 
@@ -59,12 +59,12 @@ def test_names_of_files_do_not_reach_the_terminal_raw(tmp_path, capsys):
     assert len(output.splitlines()) == 1
 
 
-def test_a_missing_package_of_the_experiments_is_named_and_others_are_not_hidden(
+def test_a_missing_package_is_named_and_others_are_not_hidden(
         capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'pandas', None)
-    for name in ('pandas', 'nosuch'):
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    for name in ('pyarrow', 'nosuch'):
         monkeypatch.setitem(COMMANDS, name, ('', name))
-    assert main(['pandas']) == 1
-    assert 'pip install pandas' in capsys.readouterr().err
+    assert main(['pyarrow']) == 1
+    assert 'pip install pyarrow' in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
         main(['nosuch'])

@@ -11,8 +11,9 @@ import shlex
 import subprocess
 import sys
 
+from experiments.__main__ import LINE
 import pytest
-from tap_ros.cli import _find_experiments, _load, COMMANDS, main, read
+from tap_ros.cli import _load, main, read, TAP_ROS
 from tap_ros.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -20,21 +21,29 @@ PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.m
          *sorted((ROOT / 'docs').rglob('*.md')), *sorted((ROOT / 'tap_ros').rglob('*.md'))]
 SHOWN = {  # one of those with the same options
     tuple(re.findall(r'--\S+', command)) or command: command.strip() for page in PAGES
-    for command in re.findall(r'-m tap_ros ([^`\n;|]+?)(?: #.*)?(?=[`\n;])', page.read_text())
+    for command in re.findall(
+        r'-m ((?:tap_ros|experiments) [^`\n;|]+?)(?: #.*)?(?=[`\n;])', page.read_text())
     if '...' not in command and '--tyro' not in command}.values()
-IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --list', 'bench all',
-                   'bench planning']
+IN_THE_MAKEFILE = ['tap_ros demo --scenes 20', 'experiments paper --jobs 2 --list',
+                   'experiments bench all', 'experiments bench planning']
+LINES = {'tap_ros': TAP_ROS, 'experiments': LINE}
 
 
 @cache
 def kinds():
-    """Return the options of each command by its words, such as 'train forward'."""
-    _find_experiments()
+    """Return the options of each command by its words, such as 'tap_ros train forward'."""
     flat = {}
-    for name, (_, module) in COMMANDS.items():
-        flat |= {f'{name} {word}': inner for word, (_, inner) in module.items()} if isinstance(
-            module, dict) else {name: module}
+    for place, line in LINES.items():
+        for name, (_, module) in line.commands.items():
+            flat |= {f'{place} {name} {word}': inner for word, (_, inner) in module.items()
+                     } if isinstance(module, dict) else {f'{place} {name}': module}
     return {words: _load(module, {}) for words, module in flat.items()}
+
+
+def given_in(line):
+    """Return the options that a command line gives."""
+    place, *words = shlex.split(line)
+    return read(words, LINES[place])[1]
 
 
 def options(kind):
@@ -53,7 +62,8 @@ def help_of(command, capsys, monkeypatch):
     """Return the help of a command in one line."""
     monkeypatch.setenv('COLUMNS', '80')
     with pytest.raises(SystemExit) as end:
-        main([*command.split(), '--help'])
+        place, *words = command.split()
+        main([*words, '--help'], LINES[place])
     assert end.value.code == 0
     return ' '.join(re.sub(r'[^\x20-\x7e]', ' ', capsys.readouterr().out).split())
 
@@ -61,7 +71,8 @@ def help_of(command, capsys, monkeypatch):
 def refused(line, capsys):
     """Return what is said of words that are wrong."""
     with pytest.raises(SystemExit) as end:
-        main(shlex.split(line))
+        place, *words = shlex.split(line)
+        main(words, LINES[place])
     assert end.value.code == 2
     return ' '.join(re.sub(r'[^\x20-\x7e]', ' ', capsys.readouterr().err).split())
 
@@ -80,9 +91,9 @@ def needed(kind, text):
 @pytest.mark.parametrize('command', kinds())
 def test_help_says_of_every_option_what_it_is_and_takes(command, capsys, monkeypatch):
     text = help_of(command, capsys, monkeypatch)
-    assert text.startswith(f'usage: python -m tap_ros {command}')
+    assert text.startswith(f'usage: python -m {command}')
     line = command + needed(kinds()[command], text)
-    before, given = read(shlex.split(line))[1], []
+    before, given = given_in(line), []
     for name, default in options(kinds()[command]):
         option = f'--{name.replace("_", "-")}'
         shown = re.findall(rf'{option}[ ,](.*?)\((?:default|required)', text)
@@ -91,33 +102,35 @@ def test_help_says_of_every_option_what_it_is_and_takes(command, capsys, monkeyp
         told = [re.sub(r'--[\w-]+,?|\{.*?\}|\[.*\]|[A-Z:=]+', ' ', each) for each in shown]
         assert any(re.search('[a-z]{2,} .*[a-z]{2,}', each) for each in told), option
         if isinstance(default, int | float | str) and not isinstance(default, bool) and (
-                option not in line):
+                option not in line and option != '--recipe'):  # without a name it is found
             given += [option, str(default)]
         choices = re.search(rf'{option} \{{([\w,-]+)\}}', text)
         if choices:
             for choice in choices[1].split(',')[-2:]:  # each takes a while
                 with suppress(ConfigError):  # valid, but only with other options
-                    assert choice in str(read([*shlex.split(line), option, choice])[1])
+                    assert choice in str(given_in(f'{line} {option} {choice}'))
             answer = refused(f'{line} {option} else', capsys)
             assert option in answer and all(each in answer for each in choices[1].split(','))
-    assert read([*shlex.split(line), *given])[1] == before
+    assert given_in(f'{line} {shlex.join(given)}') == before
 
 
 def test_commands_that_are_shown_are_valid():
     for command in [*SHOWN, *IN_THE_MAKEFILE]:
         if '--' in command or command in IN_THE_MAKEFILE:
-            assert read(shlex.split(command)), command
+            assert given_in(command), command
         else:  # a command is mentioned, what it needs is left out
             known = command.split(' bags')[0].strip()
             assert any(each.startswith(known) for each in kinds()), command
 
 
 def test_help_comes_without_what_takes_long_to_import():
-    for command, allowed in (('', ()), ('evaluate', ()), ('train predictor', ()),
-                             ('evaluate planning', ('mujoco',))):
+    for command, allowed in (('TAP_ROS', ()), ('TAP_ROS evaluate', ()),
+                             ('TAP_ROS train predictor', ()), ('LINE planning', ('mujoco',))):
+        line, *words = command.split()
         slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard'} - {*allowed}
         run = subprocess.run([sys.executable, '-c', (
-            'import atexit, sys; from tap_ros.cli import main; '
+            'import atexit, sys; from tap_ros.cli import main, TAP_ROS; '
+            'from experiments.__main__ import LINE; '
             f'atexit.register(lambda: print("slow:", {slow} & set(sys.modules))); '
-            'main(sys.argv[1:] + ["--help"])'), *command.split()], capture_output=True, text=True)
+            f'main(sys.argv[1:] + ["--help"], {line})'), *words], capture_output=True, text=True)
         assert run.returncode == 0 and run.stdout.splitlines()[-1] == 'slow: set()', command

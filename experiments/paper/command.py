@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `python -m tap_ros paper`: make the paper's prediction results again."""
+"""The command `python -m experiments paper`: make the paper's prediction results again."""
 
 from dataclasses import dataclass
 from fnmatch import fnmatch

@@ -74,7 +74,7 @@ def write_results(places):
     loaded = load_runs(folder / 'runs')
     if not loaded:
         raise ConfigError(f'{folder / "runs"}: there are no finished runs; make some with '
-                          'python -m tap_ros paper')
+                          'python -m experiments paper')
     kept, left_out = on_same_episodes(loaded)
     if left_out:
         print('scored on other episodes, left out: ' + ', '.join(run['name'] for run in left_out))

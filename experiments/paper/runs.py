@@ -125,7 +125,7 @@ class PaperRun:
     @property
     def command(self):
         """The command that makes this run."""
-        return f'python -m tap_ros paper --only {self.name}'
+        return f'python -m experiments paper --only {self.name}'
 
     def config(self, recordings, runs):
         """

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 import json
 from pathlib import Path
 
+from experiments.paper.past_settings import todays_settings
 from experiments.paper.recordings import RECORDINGS
 from experiments.paper.runs import SCALE
 from sim_bridge.collect import collect, SETTINGS_FILE
@@ -18,9 +19,7 @@ from tap_ros.engines import LOCAL, run_tasks, Work
 from tap_ros.errors import TapError
 from tap_ros.files import write_atomically
 from tap_ros.options import Folder
-from tap_ros.prediction.methods import todays_settings
-from tap_ros.prediction.training_config import DEFAULTS
-from tap_ros.training.settings import FREE
+from tap_ros.training.run_config import FREE
 from tqdm import tqdm
 
 
@@ -36,7 +35,7 @@ class Places:
 
     recordings: Folder = 'bags'
     runs: Folder = 'runs/paper'
-    results: Folder = 'docs/results'
+    results: Folder = 'runs/results'
 
     def recording(self, name):
         """Return the Path of a recording."""
@@ -54,7 +53,7 @@ def find_result(run, places):
     except (OSError, ValueError):
         return None
     settings, wanted = json.loads(json.dumps([  # no tuples
-        {**DEFAULTS, **todays_settings(result['config'])},
+        todays_settings(result['config']),
         asdict(run.config(places.recordings, places.runs))]))
     same = all(settings.get(name) == wanted.get(name)
                for name in {**settings, **wanted} if name not in FREE)

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line of Table 2 and of stacking: python -m tap_ros evaluate planning."""
+"""The command line of Table 2 and of stacking: python -m experiments planning."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -23,7 +23,7 @@ class Options:
     :param tasks: what is pushed or stacked.
     :param methods: what is compared, see experiments/planning/methods.py: direct, shipped, the
         names of predictors of the command paper, or your own; with options behind colons: half,
-        recursion<n>, rounds<n>, samples<n>, carried, tracked, true_model, twice, steps<n>. By
+        recursion<n>, rounds<n>, samples<n>, tracked, true_model, twice, steps<n>. By
         default the usual ones of each task, stacking only with weights that are there.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
@@ -52,7 +52,7 @@ class Options:
     solver: Annotated[str, one_of(names('tap_ros.solvers'))] = 'cem'
     forward_weights: ShippedFile = str(FORWARD_MODEL)
     device: str = 'cpu'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
     no_films: Flag = False
     results_only: Flag = False
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Runs what `python -m tap_ros evaluate planning` asks for, and writes its results."""
+"""Runs what `python -m experiments planning` asks for, and writes its results."""
 
 from pathlib import Path
 import shlex
@@ -102,15 +102,15 @@ def find_weights(method, task, named):
     file = str(find_predictor(named.get(method.base, usual).replace('{task}', task)))
     if not Path(file).is_file():
         raise ConfigError(
-            f'method {method.name!r}: no weights {file}; train them with `python -m tap_ros paper '
-            f'--only "{Path(usual).parent.name}"`, name them with --predictor '
+            f'method {method.name!r}: no weights {file}; train them with `python -m experiments '
+            f'paper --only "{Path(usual).parent.name}"`, name them with --predictor '
             f'{method.base}=FILE, or leave the method out with --methods')
     return file
 
 
 def _command(args, task, method):
     """Return the command that makes the numbers of one method again."""
-    words = ['python -m tap_ros evaluate planning --tasks', task, '--methods', method.name,
+    words = ['python -m experiments planning --tasks', task, '--methods', method.name,
              '--scenes', str(args.scenes)]
     for option, usual in TOLD:
         value = getattr(args, option)

@@ -28,20 +28,18 @@ class Follower:
     one on each object that is not found, as tracker_node asks for it. The tracker is shown
     CAMERA_SIZE pixels a side, the networks what they were trained on.
 
-    :param tracker: of the plugin group tap_ros.trackers. 'carried' sees what the networks see, and
-        is told the true pixels at the start and in the goal.
+    :param tracker: of the plugin group tap_ros.trackers.
     :param simulator: Simulator.
     :ivar placed: names of objects that were clicked in the goal picture.
     """
 
     def __init__(self, tracker, simulator):
-        self._simulator, self._exact, self.placed = simulator, tracker == 'carried', []
-        size = simulator.camera.width if self._exact else CAMERA_SIZE
-        self._camera = _camera(simulator.task_name, size, next(
+        self._simulator, self.placed = simulator, []
+        self._camera = _camera(simulator.task_name, CAMERA_SIZE, next(
             name for name, look in LOOKS.items() if look is simulator.look))
-        self._scale = size / simulator.camera.width
+        self._scale = CAMERA_SIZE / simulator.camera.width
         self._tracker = load_plugin('tap_ros.trackers', tracker)(PinholeCamera(
-            self._camera.camera_matrix, (size, size), self._camera.camera_pose))
+            self._camera.camera_matrix, (CAMERA_SIZE, CAMERA_SIZE), self._camera.camera_pose))
 
     def select(self, seen, seed):
         """
@@ -52,12 +50,11 @@ class Follower:
         :raises TrackingError: when nothing is found where it was clicked.
         """
         view, self._rng = _view(self._camera.reset(seed)), np.random.default_rng([seed, 0])
-        for _ in range(1 if self._exact else CLICKS):  # who is refused clicks again
-            error = 0 if self._exact else self._slips(seen)
-            clicks = (seen.object_pixels + error + 0.5) * self._scale - 0.5
+        for _ in range(CLICKS):  # who is refused clicks again
+            clicks = (seen.object_pixels + self._slips(seen) + 0.5) * self._scale - 0.5
             try:
                 return self._told(seen, self._tracker.select(
-                    view, clicks if self._exact else nearest_free(clicks, view.robot_mask)))
+                    view, nearest_free(clicks, view.robot_mask)))
             except TrackingError as refusal:
                 reason = refusal
         raise reason
@@ -69,8 +66,6 @@ class Follower:
 
     def find(self, goal):
         """Return the Observation of the goal with the pixels found in it, or clicked."""
-        if self._exact:
-            return goal
         found = self._tracker.find(_view(self._camera.goal()))
         told = self._told(goal, found)[0]
         lost = np.array([state == LOST for state in found.states])

@@ -37,7 +37,7 @@ USUAL = {
 OPTIONS = {  # option: (field, value; None: the number behind it)
     'half': ('switch', 'half'), 'stalled': ('switch', 'stalled'),  # results have it, plans not
     'recursion': ('recursion', None), 'rounds': ('rounds', None), 'samples': ('samples', None),
-    'carried': ('tracking', 'carried'), 'tracked': ('tracking', 'rigid'),
+    'tracked': ('tracking', 'rigid'),
     'twice': ('search', 'twice'), 'steps': ('step_budget', None),
     **{f'{name}_model': ('model', name) for name in names('tap_ros.forward_models')}}
 SUBGOALS_ONLY = ('switch', 'recursion', 'rounds', 'samples')
@@ -54,9 +54,8 @@ class Method:
     :param recursion: subgoals in a row.
     :param rounds: how often subgoals are predicted, see planning.reach.ReachConfig.
     :param samples: subgoals to choose from by the planner's own cost.
-    :param tracking: 'ground_truth': object pixels from the simulator at every step; 'carried':
-        only in the first picture and in the goal, then followed by the tracker of this name;
-        'rigid': clicks in the first picture, then followed, and found in the goal picture.
+    :param tracking: 'ground_truth': object pixels from the simulator at every step; 'rigid':
+        clicks in the first picture, then followed, and found in the goal picture.
     :param model: name of a forward model, such as 'true', the simulator itself.
     :param search: 'preset'; 'twice': twice the samples, elites and proposals.
     :param step_budget: control periods at most; 0: the task's, see contract.step_budget.
@@ -134,7 +133,7 @@ def parse_method(text):
     method = Method(**(values | {field: DEFAULTS[field] for field in unused}))
     if min(method.recursion, method.rounds, method.samples) < 1:
         raise ConfigError(f'method {text!r}: recursion, rounds and samples are at least 1')
-    if method.model != 'learned' and (method.samples > 1 or method.tracking == 'carried'):
-        raise ConfigError(f'method {text!r}: samples are chosen and objects carried by the '
-                          'learned model alone; leave out one of the options')
+    if method.model != 'learned' and method.samples > 1:
+        raise ConfigError(f'method {text!r}: samples are chosen by the learned model alone; leave '
+                          'out one of the options')
     return method

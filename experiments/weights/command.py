@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `python -m tap_ros weights`: make the shipped predictors again by their recipes."""
+"""The command `python -m experiments weights`: make the shipped predictors by their recipes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,12 +8,24 @@ import shlex
 from typing import Annotated
 
 from sim_bridge.collect import collect, CollectConfig
+from tap_ros.apps.train import train
 from tap_ros.options import Flag, Folder, one_of
-from tap_ros.training.recipes import RECIPES
-from tap_ros.training.train import train
 
 FRESH_SEED, FRESH_EPISODES = 900_000, 100  # of the scenes that weights are scored in
-SHIPPED = [name for name, recipe in RECIPES['predictor'].items() if recipe.recordings]
+# Of each recipe: the task, and by the names of their folders what is recorded to train on, options
+# of `collect` beside the task.
+SHIPPED = {
+    'push2': ('push2', {'push2': {'episodes': 2000},
+                        'push2_random': {'episodes': 3500, 'appearance': 'random'}}),
+    'order2': ('order2', {'order2': {'episodes': 700}}),
+    'order3': ('order3', {'order3': {'episodes': 700}}),
+    'push3': ('push3', {'push3': {'episodes': 600}}),
+    'stack2': ('stack2', {'stack2': {'episodes': 1000}}),
+    'stack3': ('stack3', {'stack3': {'episodes': 1000}}),
+    'grasp': ('grasp', {'grasp': {'episodes': 3000}}),
+    'grasp_forward': ('grasp', {'grasp': {'episodes': 3000}}),
+    'pick_place': ('pick_place', {'pick_place': {'episodes': 3000}}),
+    'pick_place_vae': ('pick_place', {'pick_place': {'episodes': 3000}})}
 
 
 @dataclass(frozen=True)
@@ -45,10 +57,9 @@ def collections(name, bags):
     :param bags: folder of recordings.
     :return: {folder: options of `collect`}.
     """
-    recipe = RECIPES['predictor'][name]
-    found = {**recipe.recordings, f'fresh_{recipe.task}': {
-        'episodes': FRESH_EPISODES, 'seed': FRESH_SEED}}
-    return {str(Path(bags, folder)): {'task': recipe.task, **options}
+    task, recordings = SHIPPED[name]
+    found = {**recordings, f'fresh_{task}': {'episodes': FRESH_EPISODES, 'seed': FRESH_SEED}}
+    return {str(Path(bags, folder)): {'task': task, **options}
             for folder, options in found.items()}
 
 
@@ -88,5 +99,5 @@ def run(args):
         run_folder = Path(args.runs, name)
         train(recordings, run_folder, recipe=name, threads=args.threads)
         Path(args.out).mkdir(parents=True, exist_ok=True)
-        print(ship(name, RECIPES['predictor'][name].task, run_folder, fresh, args.out,
+        print(ship(name, SHIPPED[name][0], run_folder, fresh, args.out,
                    commands(name)), flush=True)

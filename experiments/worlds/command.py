@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The command `python -m tap_ros worlds`: who finds the bottleneck in demonstrations of others.
+The command `python -m experiments worlds`: who finds the bottleneck in demonstrations of others.
 
 Demonstrations of other simulators, keyframes of them, and predictors trained on them.
 """
@@ -31,10 +31,10 @@ from tap_ros.files import write_atomically, write_rows
 from tap_ros.images.drawing import grid
 from tap_ros.options import Flag, Folder
 from tap_ros.prediction.marks import chance
+from tap_ros.prediction.training_config import RECIPES
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.recording.reading import Reading
-from tap_ros.training.recipes import find_recipe
 
 Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'fix to marks']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
@@ -74,7 +74,7 @@ class Options:
     seeds: int = 3
     bags: Folder = 'bags/worlds'
     runs: Folder = 'runs/worlds'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
     results_only: Flag = False
     engine: Engine = Engine()
 
@@ -221,5 +221,5 @@ def page(rows):
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
     return render('worlds/templates/worlds.md.j2', marked=MARKED, held_out=HELD_OUT,
                   seeds=seeds['trained'], seeds_aside=seeds['aside'].get('marks'),
-                  settings=find_recipe('predictor', SETTINGS['recipe']).settings,
+                  settings=RECIPES[SETTINGS['recipe']],
                   **{kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})

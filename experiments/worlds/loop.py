@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The command `python -m tap_ros worlds-loop`: a closed loop that another world judges.
+The command `python -m experiments worlds-loop`: a closed loop that another world judges.
 
 Bags of pushes in Meta-World, a forward model and predictors from them, and the loop of the nodes,
 planning/reach.py, in fresh scenes. What counts is the environment's own signal.
@@ -21,6 +21,7 @@ import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.gym_pushes import push_to_goal
 from sim_bridge.world_protocol import make_world
+from tap_ros.apps.train import train
 from tap_ros.contract import ACTION_LIMIT, step_budget
 from tap_ros.engines import Engine
 from tap_ros.errors import SceneError
@@ -34,7 +35,6 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
-from tap_ros.training.train import train
 from tqdm import tqdm
 
 WORLD, IMAGE_SIZE = 'metaworld', 64
@@ -80,7 +80,7 @@ class Options:
     scenes: int = 50
     bags: Folder = 'bags/loop'
     runs: Folder = 'runs/loop'
-    out: Folder = 'docs/results'
+    out: Folder = 'runs/results'
     results_only: Flag = False
     engine: Engine = Engine()
 

@@ -81,13 +81,13 @@ def train_all(folders, methods, seeds, out, engine):
 def train_and_score(folder, method, seed, out):
     """Train a predictor; return which held-out episodes it hits, exactly and within a frame."""
     from sim_bridge.collect import BOTTLENECKS_FILE
+    from tap_ros.apps.train import train
     from tap_ros.evaluation.keyframes import is_hit
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.prediction.predictor import load_network
     from tap_ros.recording.bags import reading_like
     from tap_ros.recording.cache import open_recordings
     from tap_ros.recording.marks import read_marks
-    from tap_ros.training.train import train
     import torch
     path = Path(out, 'hits.json')
     if path.exists():

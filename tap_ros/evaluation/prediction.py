@@ -24,7 +24,7 @@ from tap_ros.evaluation.samples import draw_latents
 from tap_ros.evaluation.shown import SHOWN, ShownScorer
 from tap_ros.images.pixels import to_float
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.prediction.batches import Batch, make_batch, Sampling
+from tap_ros.prediction.batches import Batch, make_batch, Pictures, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.protocol import Predictor, Question
@@ -132,7 +132,7 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
     for at in range(0, len(episodes), _BATCH):
         chosen = episodes[at:at + _BATCH]
         batch = make_batch(store, chosen, Sampling(
-            goal_picture=goal_picture, forward=forward), filled=filled)
+            goal_picture=goal_picture, forward=forward), pictures=Pictures(filled=filled))
         with torch.inference_mode():
             if isinstance(network, torch.nn.Module):
                 batch = batch.to(next(network.parameters()).device)

@@ -10,7 +10,7 @@ import numpy as np
 from tap_ros.evaluation.bottleneck import context_pixels
 from tap_ros.evaluation.command import SAMPLES
 from tap_ros.images.pixels import to_float
-from tap_ros.prediction.batches import make_batch, Sampling
+from tap_ros.prediction.batches import make_batch, Pictures, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.networks import Prediction, PredictorNetwork
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
@@ -84,7 +84,8 @@ def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: It
     for i in episodes:
         batch = make_batch(store, [i], Sampling(
             goal_picture=goal_picture,
-            forward=network.config.num_context == 1), filled=filled).to(device)
+            forward=network.config.num_context == 1),
+            pictures=Pictures(filled=filled)).to(device)
         z = draw_latents([i], count, network.config.latent_size)[0].to(device)
         with torch.inference_mode():
             prediction = network(to_float(batch.context).expand(count, -1, -1, -1, -1), z)

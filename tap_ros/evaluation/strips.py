@@ -13,7 +13,7 @@ from tap_ros.evaluation.prediction import ask, is_forward
 from tap_ros.files import write_atomically
 from tap_ros.images.drawing import enlarge, GAP, grid, overlay, png_bytes
 from tap_ros.images.pixels import to_uint8
-from tap_ros.prediction.batches import make_batch, Sampling
+from tap_ros.prediction.batches import make_batch, Pictures, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.protocol import Predictor
@@ -55,7 +55,8 @@ def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
     :return: uint8 (height, width, 3).
     """
     batch = make_batch(store, episodes, Sampling(
-        goal_picture=goal_picture, forward=is_forward(network)), filled=filled)
+        goal_picture=goal_picture, forward=is_forward(network)),
+                       pictures=Pictures(filled=filled))
     with torch.inference_mode():
         image, maps_of = ask(network, batch, episodes)
         visible = batch.visible(image[:, None].cpu())

@@ -8,14 +8,13 @@ First the windows of recordings that it is taken over, and their augmentation.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Self, TYPE_CHECKING
 
 import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import RecordingError
 from tap_ros.images.pixels import to_float
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.planning.table import mirror_table
 from tap_ros.training.robot_mask import hidden_pixels, RobotMask
 import torch
@@ -25,6 +24,11 @@ if TYPE_CHECKING:
     from tap_ros.training.inpainted import Episodes
 
 COLOUR_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
+MOTION_FACTOR = 8.0  # extra weight of pixels that changed since the window's first picture
+STILL_WEIGHT = 2e-4  # of the mean share of the crop that is said to move
+# Of the mean share of the picture that is said to be objects: with none, a table with grain counts
+# as one, too.
+OBJECT_WEIGHT = 5e-3
 MOTION_THRESHOLD = 0.08  # of the range 2: mean channel difference that counts as change
 
 
@@ -45,41 +49,64 @@ class Windows:
         return Windows(**{name: tensor.to(device) for name, tensor in vars(self).items()})
 
 
-def make_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int],
-                 starts: np.ndarray | Sequence[int], steps: int, homography: torch.Tensor,
-                 mirrored: np.ndarray, orders: np.ndarray | Sequence[int],
+@dataclass(frozen=True)
+class Cuts:
+    """
+    Which windows are read, of B, and how they are changed; by default not at all.
+
+    :param episodes: (B,) episode indices; starts: (B,) first frames; steps: T.
+    :param mirrored: bool (B,), left to right; orders: (B,), index to COLOUR_ORDERS.
+    """
+
+    episodes: np.ndarray | Sequence[int]
+    starts: np.ndarray | Sequence[int]
+    steps: int
+    mirrored: np.ndarray | bool = False
+    orders: np.ndarray | int = 0
+
+    @classmethod
+    def draw(cls, store: 'Episodes', episodes: np.ndarray, batch_size: int, steps: int,
+             rng: np.random.Generator) -> Self:
+        """Draw from episodes, each with more than `steps` frames; half of them are mirrored."""
+        chosen = rng.choice(episodes, batch_size)
+        lengths = np.asarray(store.lengths)[chosen]
+        starts = (rng.random(batch_size) * (lengths - steps)).astype(int)
+        return cls(chosen, starts, steps, rng.random(batch_size) < 0.5,
+                   rng.integers(len(COLOUR_ORDERS), size=batch_size))
+
+
+def make_windows(store: 'Episodes', cuts: Cuts, homography: torch.Tensor,
                  robot_mask: RobotMask = 'none') -> Windows:
     """
     Read windows and change how they look: mirrored left to right, in other colours.
 
-    :param episodes: (B,) episode indices; starts (B,) first frames; steps T.
     :param homography: (3, 3) of the table.
-    :param mirrored: (B,) bool; orders (B,) index to COLOUR_ORDERS.
     :param robot_mask: see robot_mask.hidden_pixels; the episodes have masks unless it is 'none'.
     :return: Windows; the grippers and actions of mirrored ones have x negated.
     :raises RecordingError: where gripper positions are missing.
     """
     images, grippers, actions, hidden = [], [], [], []
-    for i, start in zip(episodes, starts):
-        episode, part = store[int(i)], slice(start, start + steps + 1)
+    for i, start in zip(cuts.episodes, cuts.starts):
+        episode, part = store[int(i)], slice(start, start + cuts.steps + 1)
         images.append(episode.frames[part])
         grippers.append(episode.grippers[part])
-        actions.append(episode.actions[start:start + steps])
+        actions.append(episode.actions[start:start + cuts.steps])
         if robot_mask == 'none' or episode.robot_masks is None:
             hidden.append(np.zeros(images[-1].shape[:-1], bool))
         else:
             hidden.append(hidden_pixels(episode.robot_masks[part], robot_mask))
     hands = np.stack(grippers).astype(np.float32)
     if not np.isfinite(hands).all():
-        bad = int(np.asarray(episodes)[~np.isfinite(hands).all((1, 2))][0])
+        bad = int(np.asarray(cuts.episodes)[~np.isfinite(hands).all((1, 2))][0])
         raise RecordingError(
             f'/joint_states: episode {bad} lacks gripper positions; the forward model needs '
             f'{", ".join(GRIPPER_JOINTS)} at every picture')
+    B = len(images)
     batch = Windows(
         to_float(np.stack(images)), torch.from_numpy(np.stack(hidden)[:, :, None]),
         torch.from_numpy(hands), torch.from_numpy(np.stack(actions).astype(np.float32)),
-        homography.expand(len(images), 3, 3).clone(), torch.from_numpy(np.asarray(mirrored)),
-        torch.tensor([COLOUR_ORDERS[i] for i in orders]))
+        homography.expand(B, 3, 3).clone(), torch.from_numpy(np.full(B, cuts.mirrored)),
+        torch.tensor(COLOUR_ORDERS)[np.full(B, cuts.orders)])
     batch.images = recolour(batch.images, batch.colours[:, None])
     batch.images = mirror(batch.images, batch.mirrored)
     batch.hidden = mirror(batch.hidden, batch.mirrored)
@@ -88,23 +115,6 @@ def make_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int],
     batch.homography[batch.mirrored] = mirror_table(
         batch.homography, batch.images.shape[-1])[batch.mirrored]
     return batch
-
-
-def draw_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int], batch_size: int,
-                 steps: int, homography: torch.Tensor, rng: np.random.Generator,
-                 augment: bool = True, robot_mask: RobotMask = 'none') -> Windows:
-    """
-    Draw a batch of windows at random, and how they are changed.
-
-    :param episodes: episode indices to draw from, each with more than `steps` frames.
-    :param homography: see make_windows; robot_mask: likewise.
-    """
-    chosen = rng.choice(episodes, batch_size)
-    lengths = np.asarray(store.lengths)[chosen]
-    starts = (rng.random(batch_size) * (lengths - steps)).astype(int)
-    mirrored = rng.random(batch_size) < 0.5 * augment
-    orders = rng.integers(len(COLOUR_ORDERS), size=batch_size) * augment
-    return make_windows(store, chosen, starts, steps, homography, mirrored, orders, robot_mask)
 
 
 def recolour(images: torch.Tensor, colours: torch.Tensor) -> torch.Tensor:
@@ -132,9 +142,9 @@ def draw_arm_like(model: LearnedForwardModel, grippers: torch.Tensor, mirrored: 
     return mirror(recolour(model.draw_arm(plain), colours), mirrored)
 
 
-def motion_weight(target: torch.Tensor, first: torch.Tensor, factor: float) -> torch.Tensor:
+def motion_weight(target: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
     """
-    Weight pixels that differ from the first picture, and their neighbours, by 1 + factor.
+    Weight pixels that differ from the first picture, and their neighbours, by 1 + MOTION_FACTOR.
 
     Most of a picture never changes; without this weight, predicting no motion is nearly perfect.
 
@@ -142,7 +152,7 @@ def motion_weight(target: torch.Tensor, first: torch.Tensor, factor: float) -> t
     :return: (B, 1, H, W).
     """
     changed = ((target - first).abs().mean(1, keepdim=True) > MOTION_THRESHOLD).float()
-    return 1 + factor * F.max_pool2d(changed, 3, 1, 1)
+    return 1 + MOTION_FACTOR * F.max_pool2d(changed, 3, 1, 1)
 
 
 def picture_loss(predicted: torch.Tensor, target: torch.Tensor,
@@ -163,7 +173,7 @@ def picture_loss(predicted: torch.Tensor, target: torch.Tensor,
 
 
 def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Collection[int],
-                 config: ForwardTrainingConfig) -> tuple[torch.Tensor, dict[str, float]]:
+                 ) -> tuple[torch.Tensor, dict[str, float]]:
     """
     Roll the model along the windows and compare pictures at some of the steps.
 
@@ -188,11 +198,11 @@ def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Coll
             predicted, _ = model.picture(scene, flow, arm, batch.homography)
             target = batch.images[:, t]
             predicted = torch.where(batch.hidden[:, t], target, predicted)
-            weight = torch.maximum(*(motion_weight(picture, first, config.motion_factor)
+            weight = torch.maximum(*(motion_weight(picture, first)
                                      for picture in (target, predicted.detach())))
             pictures = pictures + picture_loss(predicted, target, weight)
     parts = {'picture': pictures / len(picture_steps), 'moving': moving / count,
              'objects': scene.objects[:, 3].mean()}
-    loss = (parts['picture'] + config.still_weight * parts['moving']
-            + config.object_weight * parts['objects'])
+    loss = (parts['picture'] + STILL_WEIGHT * parts['moving']
+            + OBJECT_WEIGHT * parts['objects'])
     return loss, {k: float(v.detach()) for k, v in parts.items()}

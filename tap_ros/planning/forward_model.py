@@ -21,7 +21,7 @@ draws none.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -40,7 +40,7 @@ from tap_ros.planning.table import (
 )
 from tap_ros.training.devices import has_bfloat16, placed
 from tap_ros.training.robot_mask import RobotMask
-from tap_ros.training.weights import LATER, load_weights, make_network
+from tap_ros.training.weights import load_weights, make_network
 import torch
 from torch import nn
 
@@ -68,10 +68,10 @@ class ForwardModelConfig:
     encoder_width: int = 16
     sprite_size: int = 24  # pixels, side of the picture of the arm
     # what the pictures are without, see robot_mask.hidden_pixels
-    robot_mask: RobotMask = field(default='none', metadata=LATER)
-    crop: str = field(default='', metadata=LATER)  # of the camera's pictures, see crop.Crop
-    crop_size: int = field(default=0, metadata=LATER)  # likewise, Crop.size
-    camera_size: tuple[int, int] = field(default=(0, 0), metadata=LATER)  # (0, 0): unknown
+    robot_mask: RobotMask = 'none'
+    crop: str = ''  # of the camera's pictures, see crop.Crop
+    crop_size: int = 0  # likewise, Crop.size
+    camera_size: tuple[int, int] = (0, 0)  # (0, 0): unknown
 
     def __post_init__(self) -> None:
         if len(self.table) != 9 or len(self.arm) != 12 or self.image_size % 4 or any(

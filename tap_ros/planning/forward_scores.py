@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.images.pixels import to_float
-from tap_ros.planning.forward_loss import make_windows, MOTION_THRESHOLD
+from tap_ros.planning.forward_loss import Cuts, make_windows, MOTION_THRESHOLD
 from tap_ros.planning.forward_model import LearnedForwardModel
 import torch
 
@@ -107,8 +107,8 @@ def measure_pictures(model: LearnedForwardModel, store: 'Episodes',
         if not count:
             continue
         windows = make_windows(
-            store, [i] * count, starts, steps[-1], model.homography.cpu(), np.zeros(count, bool),
-            [0] * count, model.config.robot_mask).to(model.homography.device)
+            store, Cuts([i] * count, starts, steps[-1]), model.homography.cpu(),
+            model.config.robot_mask).to(model.homography.device)
         first, gripper = windows.images[:, 0], windows.grippers[:, 0]
         scene, flow = model.look(first, model.draw_arm(gripper)[:, 3:]), model.still(count)
         rows = []

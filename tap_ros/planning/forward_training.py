@@ -7,7 +7,8 @@ Everything random is drawn from (seed, step), so that a run that was interrupted
 same result.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 import sys
 
 import numpy as np
@@ -15,69 +16,65 @@ from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_uint8
-from tap_ros.planning.forward_loss import draw_arm_like, draw_windows, forward_loss, Windows
+from tap_ros.planning.forward_loss import (
+    Cuts,
+    draw_arm_like,
+    forward_loss,
+    make_windows,
+    Windows,
+)
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_scores import held_out_scores
-from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig
+from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.recording.reading import Reading
-from tap_ros.training import run
 from tap_ros.training.inpainted import Episodes, FilledStore
 from tap_ros.training.robot_mask import fill_from_past
+from tap_ros.training.run import Run
 from tap_ros.weights import FORWARD_MODEL
 import torch
 
+AVERAGE_DECAY = 0.995  # of the moving average that is shipped
+HORIZON = 8  # control periods of the longest windows
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
 MOST_MISSED = 3 / 64  # of the picture's side, by which the arm may be beside its fit
-Item = tuple[Windows, set[int]]  # of a step: windows, and which of their pictures are compared
 
 
 def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: bool = True) -> str:
-    """Train a forward model, or go on with a run that was interrupted, see run.run."""
-    return run.run(config, 'forward_model', _prepare, min_frames=config.horizon + 1,
-                   stop_at=stop_at, progress=progress)
+    """
+    Train a forward model, or go on with a run that was interrupted, see run.Run.
+
+    :return: path of the weights file.
+    """
+    with Run(config, 'forward_model', HORIZON + 1, stop_at, progress) as run:
+        network = LearnedForwardModel(model_config(config, run.store, run.training))
+        if config.initial_weights and not run.checkpoint.exists():
+            take_weights(network, config.initial_weights)
+        state = run.begin(network, AVERAGE_DECAY)
+        # The picture that is looked at shows what a node would show; see FreeView.
+        episodes: Episodes = run.store if config.robot_mask == 'none' else FilledStore(
+            run.store, config.robot_mask, progress, fill_from_past)
+        draw = partial(draw_step, config, episodes, run.training, state.network.homography.cpu())
+        for _, (windows, shown) in run.steps(draw, partial(_score, run, episodes)):
+            loss, parts = forward_loss(state.network, windows.to(run.device), shown)
+            state.optimizers[0].zero_grad()
+            loss.backward()
+            norm = state.clip_gradients()
+            state.optimizers[0].step()
+            run.show({**parts, 'gradient_norm': norm})
+    return run.weights
 
 
-def _prepare(this: run.Run) -> run.Course[LearnedForwardModel, Item]:
-    """Make the model of a run, what it is trained on and how."""
-    config, store, training = this.config, this.store, this.training
-    network = LearnedForwardModel(model_config(config, store, training))
-    if config.initial_weights and not this.checkpoint.exists():
-        path = FORWARD_MODEL if config.initial_weights == 'push' else config.initial_weights
-        others = LearnedForwardModel.load(path, precision='float32').state_dict()
-        del others['sprite']  # the picture of another arm
-        try:
-            network.load_state_dict(others, strict=False)
-        except RuntimeError as error:  # names the shapes
-            raise ConfigError(
-                f'initial_weights: {path} are for another network: {error}') from error
-    state = this.begin(network, {}, lambda settings: {**DEFAULTS, **settings})
-    # The picture that is looked at shows what a node would show; see FreeView.
-    episodes: Episodes = store if config.robot_mask == 'none' else FilledStore(
-        store, config.robot_mask, this.progress, fill_from_past)
-    homography = state.network.homography.cpu()
-
-    def batches(first: int, last: int) -> Iterator[Item]:
-        for step in range(first, last):
-            yield draw_step(config, episodes, training, step, homography)
-
-    def step(item: Item) -> Callable[[], run.Numbers]:
-        windows, shown = item
-        loss, parts = forward_loss(state.network, windows.to(this.device), shown, config)
-        state.optimizers[0].zero_grad()
-        loss.backward()
-        norm = state.clip_gradients(config.gradient_clip)
-        state.optimizers[0].step()
-        return lambda: parts | {'gradient_norm': norm.item()}
-
-    def score() -> tuple[run.Numbers, Mapping[str, np.ndarray]]:
-        parts = {'training': training, 'held_out': this.held_out}
-        return held_out_scores(state.average, episodes, this.held_out), {
-            name: sample_grid(state.average, episodes, part, config)
-            for name, part in parts.items() if len(part)}
-
-    return run.Course(state, batches, step, score)
+def take_weights(network: LearnedForwardModel, initial_weights: str) -> None:
+    """Take over the weights of another forward model, but for its picture of the arm."""
+    path = FORWARD_MODEL if initial_weights == 'push' else initial_weights
+    others = LearnedForwardModel.load(path, precision='float32').state_dict()
+    del others['sprite']
+    try:
+        network.load_state_dict(others, strict=False)
+    except RuntimeError as error:  # names the shapes
+        raise ConfigError(f'initial_weights: {path} are for another network: {error}') from error
 
 
 def model_config(config: ForwardTrainingConfig, store: EpisodeStore,
@@ -106,9 +103,8 @@ def model_config(config: ForwardTrainingConfig, store: EpisodeStore,
              else fit_table(episodes, arm))
     return ForwardModelConfig(
         table=tuple(table.ravel().tolist()), arm=tuple(arm.ravel().tolist()),
-        image_size=store.image_size[0], width=config.width, features=config.features,
-        robot_mask=config.robot_mask, crop=config.crop, crop_size=config.size,
-        camera_size=store.camera_size or (0, 0))
+        image_size=store.image_size[0], robot_mask=config.robot_mask, crop=config.crop,
+        crop_size=config.size, camera_size=store.camera_size or (0, 0))
 
 
 def cut_projection(projection: Sequence[float], store: EpisodeStore,
@@ -128,8 +124,8 @@ def cut_projection(projection: Sequence[float], store: EpisodeStore,
     return matrix / matrix[2, 3]
 
 
-def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarray, step: int,
-              homography: torch.Tensor) -> tuple[Windows, set[int]]:
+def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarray,
+              homography: torch.Tensor, step: int) -> tuple[Windows, set[int]]:
     """
     Draw the windows of one step, and which of their pictures are compared.
 
@@ -138,24 +134,31 @@ def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarr
     """
     rng = np.random.default_rng([config.seed, step])
     growth = min(1.0, (step + 1) / max(1, config.grow * config.steps))
-    length = max(1, round(min(2, config.horizon) + growth * (config.horizon - 2)))
-    batch = draw_windows(
-        store, training, config.batch_size, length, homography, rng, config.augment,
-        config.robot_mask)
-    return batch, set((rng.permutation(length)[:config.pictures] + 1).tolist())
+    length = round(2 + growth * (HORIZON - 2))
+    cuts = Cuts.draw(store, training, config.batch_size, length, rng)
+    return (make_windows(store, cuts, homography, config.robot_mask),
+            set((rng.permutation(length)[:config.pictures] + 1).tolist()))
+
+
+def _score(run: Run[ForwardTrainingConfig], episodes: Episodes,
+           ) -> tuple[Mapping[str, float], Mapping[str, np.ndarray]]:
+    """Score the averaged model; show some windows of all."""
+    model, parts = run.state.average, {'training': run.training, 'held_out': run.held_out}
+    return held_out_scores(model, episodes, run.held_out), {
+        name: sample_grid(model, episodes, part) for name, part in parts.items() if len(part)}
 
 
 @torch.no_grad()
 def sample_grid(model: LearnedForwardModel, store: Episodes, episodes: np.ndarray,
-                config: ForwardTrainingConfig, rows: int = 6, seed: int = 0) -> np.ndarray:
+                rows: int = 6, seed: int = 0) -> np.ndarray:
     """
     Show windows: first picture, its objects' mask and background, then true beside predicted.
 
     :return: uint8 (height, width, 3).
     """
-    batch = draw_windows(
-        store, episodes, rows, config.horizon, model.homography.cpu(),
-        np.random.default_rng(seed), augment=False).to(model.homography.device)
+    cuts = Cuts.draw(store, episodes, rows, HORIZON, np.random.default_rng(seed))
+    batch = make_windows(store, Cuts(cuts.episodes, cuts.starts, HORIZON),
+                         model.homography.cpu()).to(model.homography.device)
 
     def arm(t: int) -> torch.Tensor:
         return draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
@@ -164,9 +167,9 @@ def sample_grid(model: LearnedForwardModel, store: Episodes, episodes: np.ndarra
     columns = [list(to_uint8(batch.images[:, 0])), grey_panels(scene.objects[:, 3].cpu()),
                list(to_uint8(scene.background))]
     flow, gripper = model.still(rows), batch.grippers[:, 0]
-    for t in range(1, config.horizon + 1):
+    for t in range(1, HORIZON + 1):
         flow, gripper, _ = model.advance(scene.features, flow, gripper, batch.actions[:, t - 1])
-        if t in (config.horizon // 3, 2 * config.horizon // 3, config.horizon):
+        if t in (HORIZON // 3, 2 * HORIZON // 3, HORIZON):
             predicted, _ = model.picture(scene, flow, arm(t), batch.homography)
             columns += [list(to_uint8(batch.images[:, t])), list(to_uint8(predicted))]
     return grid([list(row) for row in zip(*columns)])

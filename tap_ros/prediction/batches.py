@@ -43,6 +43,7 @@ class Batch:
         targets, video and bare are black, and nothing counts; None: True everywhere.
     :param preference: float32 (B, levels, T), w(t) of Eq. 5 for selection marks, of each level of
         recursion; else None.
+    :param augmentation: of all pictures that networks see; None: they see them as they are.
     """
 
     context: torch.Tensor
@@ -56,6 +57,7 @@ class Batch:
     bare: torch.Tensor | None = None
     seen: torch.Tensor | None = None
     preference: torch.Tensor | None = None
+    augmentation: 'Augmentation | None' = None
 
     @property
     def measured(self) -> torch.Tensor:
@@ -73,14 +75,14 @@ class Batch:
 
     def to(self, device: torch.device | str) -> 'Batch':
         """Copy everything to a device."""
-        return Batch(**{name: tensor.to(device, non_blocking=True)
-                        for name, tensor in vars(self).items() if tensor is not None})
+        return Batch(**{name: value.to(device, non_blocking=True)
+                        for name, value in vars(self).items() if value is not None})
 
 
 @dataclass(frozen=True)
 class Sampling:
     """
-    What is taken from an episode; what is not told here, see training_config.DataSettings.
+    What is taken from an episode; what is not told here, see training_config.TrainingConfig.
 
     :param forward: whether the start picture is all of the context.
     :param fraction: take only the frame at this share of the episode, 0 to 1, as fixed-time
@@ -161,20 +163,31 @@ def fixed_time(fraction: float, end: int, first: int, last: int) -> int:
     return int(np.clip(int(fraction * end + 0.5), first, last))
 
 
+@dataclass(frozen=True)
+class Pictures:
+    """
+    Where the pictures of a batch come from, and what is known of them.
+
+    :param frames: where they come from, see training/frames.py; None: the store.
+    :param filled: with a robot mask, where targets and video come from; see training/inpainted.py.
+    :param preference: of every episode of the store w of its frames, (levels, T).
+    """
+
+    frames: Frames | None = None
+    filled: 'Filled | None' = None
+    preference: Sequence[np.ndarray] | None = None
+
+
 def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
-               sampling: Sampling = Sampling(), frames: Frames | None = None,
-               rng: np.random.Generator | None = None, filled: 'Filled | None' = None,
-               preference: Sequence[np.ndarray] | None = None) -> Batch:
+               sampling: Sampling = Sampling(), rng: np.random.Generator | None = None,
+               pictures: Pictures = Pictures()) -> Batch:
     """
     Gather context pictures and targets.
 
     :param episodes: indices of B episodes.
-    :param sampling: Sampling; by default all frames between the first and the last.
-    :param frames: where the pictures come from, see training/frames.py; None: the store.
+    :param sampling: by default all frames between the first and the last.
     :param rng: numpy Generator; needed only where something is drawn.
-    :param filled: with a robot mask, where targets and video come from; see training/inpainted.py.
-    :param preference: of every episode of the store w of its frames, (levels, T).
-    :return: Batch.
+    :return: Batch, without augmentation.
     """
     rng = rng or np.random.default_rng(0)
     rows = [_choose(store, i, sampling, rng) for i in episodes]
@@ -187,7 +200,8 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
         shown[b] = row.start + times[b]
     context, video, bounds = (np.array([getattr(row, name) for row in rows])
                               for name in ('context', 'video', 'bounds'))
-    frames = frames or MappedFrames(store)
+    frames, filled = pictures.frames or MappedFrames(store), pictures.filled
+    preference = pictures.preference
     first, last, end = torch.from_numpy(bounds).split(1, dim=1)
     free = filled.frames if filled else frames
     batch = Batch(
@@ -203,9 +217,9 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     seen = torch.from_numpy(filled.seen[np.asarray(episodes)]).to(bare.device)
     batch = replace(batch, seen=seen, bare=bare.clone(), context=torch.where(
         chosen[:, None, None, None, None], bare, batch.context))
-    for pictures in (batch.targets, batch.video, batch.bare):
-        if pictures is not None:
-            pictures.masked_fill_(~seen[:, None, ..., None], 0)
+    for shown_there in (batch.targets, batch.video, batch.bare):
+        if shown_there is not None:
+            shown_there.masked_fill_(~seen[:, None, ..., None], 0)
     return batch
 
 
@@ -266,25 +280,26 @@ class Augmentation:
     gain: torch.Tensor
 
     @classmethod
-    def draw(cls, batch_size: int, flip: bool, colour: bool, brightness: float,
+    def draw(cls, batch_size: int, colour: bool, brightness: float,
              rng: np.random.Generator) -> Self:
         """
-        Draw one for each episode of a batch.
+        Draw one for each episode of a batch; half of them are mirrored.
 
-        :param flip: whether to mirror half of them; colour: to permute their colour channels.
+        :param colour: whether to permute their colour channels.
         :param brightness: gains lie within 1 +- this.
         """
         order = np.argsort(rng.random((batch_size, 3)), 1)
         if not colour:
             order = np.tile(np.arange(3), (batch_size, 1))
-        flips = rng.random(batch_size) < (0.5 if flip else 0.0)
+        flips = rng.random(batch_size) < 0.5
         gain = 1 + brightness * rng.uniform(-1, 1, (batch_size, 3))
         return cls(torch.from_numpy(flips), torch.from_numpy(order),
                    torch.from_numpy(gain.astype(np.float32)))
 
-    def to(self, device: torch.device | str) -> 'Augmentation':
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> 'Augmentation':
         """Copy everything to a device."""
-        return Augmentation(self.flip.to(device), self.order.to(device), self.gain.to(device))
+        return Augmentation(**{name: value.to(device, non_blocking=non_blocking)
+                               for name, value in vars(self).items()})
 
     def apply(self, images: torch.Tensor) -> torch.Tensor:
         """Change pictures (B, N, 3, H, W) in [-1, 1]; a gain may brighten them beyond 1."""

@@ -31,8 +31,9 @@ def features_of(store: 'EpisodeStore', i: int, robot_mask: RobotMask) -> np.ndar
                     else hidden_pixels(episode.robot_masks, robot_mask))
 
 
-def weigh(store: 'EpisodeStore', config: 'TrainingConfig',
-          training: np.ndarray) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
+def episode_preferences(
+        store: 'EpisodeStore', config: 'TrainingConfig', training: np.ndarray,
+) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
     """
     Compute the preference w(t) that a training needs, by stillness or learned from marks.
 
@@ -47,7 +48,7 @@ def weigh(store: 'EpisodeStore', config: 'TrainingConfig',
     marks = read_marks(config.marks, store)
     preferences, about = learn_marks(
         store, marks, training, config.recursion, config.forward, config.robot_mask)
-    tell(about)
+    print_marks_report(about)
     return prefer(store, preferences, config.robot_mask), {'marks': {
         'sha256': marks.digest, 'levels': about,
         'preferences': [preference.to_json() for preference in preferences]}}
@@ -113,8 +114,8 @@ def chance(mark: Mark, length: int, tolerance: int = 1) -> float:
     return (last - first + 1) / (length - 2)
 
 
-def tell(about: Sequence[Mapping[str, Any]]) -> None:
-    """Say before a training what the marks are worth; on stderr."""
+def print_marks_report(about: Sequence[Mapping[str, Any]]) -> None:
+    """Print before a training what the marks are worth; on stderr."""
     from scipy.stats import binomtest  # takes a second to import
     for level, facts in enumerate(about, start=1):
         count = facts['demonstrations']

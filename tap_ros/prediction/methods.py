@@ -1,8 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The methods of the paper (section 4), by fields; their names in results and older weights."""
+"""The methods of the paper (section 4), by fields, and their names in results."""
 
-from collections.abc import Mapping
 import re
 from typing import Any, get_args, Literal
 
@@ -17,15 +16,11 @@ Decoder = Literal['separate', 'shared']
 
 _NAME = re.compile(r'(?P<loss>fix|min|genmin)(?P<number>\d+(\.\d+)?)?'
                    r'(?P<model>-wo-gan|-vae-gan|-vae)?(\+(?P<selection>relative|progress|still|marks))?')
-# Settings of earlier versions, and the value at which they did nothing.
-_GONE = {'bell_edge': 2 / 3, 'changed_weight': 0.0, 'match_temperature': 0.0, 'match_share': 0.5,
-         'flow_scale': 16.0, 'max_frames': 0, 'pretrain_steps': 0, 'outer_power': 1.0,
-         'compile': False, 'discriminator_rate': 2e-4}
 
 
 def method_fields(name: str) -> dict[str, Any]:
     """
-    Turn a method's name into fields of ObjectiveSettings.
+    Turn a method's name into fields of TrainingConfig.
 
     As in the paper's tables, fix, min and genmin alone are trained with l1 and GAN; -wo-gan is l1
     only, -vae the CVAE without GAN (Eq. 9), -vae-gan both (Eq. 10). A number is the fraction of
@@ -63,16 +58,3 @@ def method_name(loss: str, selection: str, gan: bool, latent: str, fraction: flo
     chosen = f'+{selection}' if selection == 'marks' or (
         loss == 'genmin' and selection != 'absolute') else ''
     return f'{loss}{number}{model}{chosen}'
-
-
-def todays_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Return settings of a training, of any version, by the fields of today.
-
-    :param settings: as in a weights file, a checkpoint or a file of results.
-    :return: dict; what today's version cannot do keeps its old name.
-    """
-    gone = {**_GONE, 'detach_recursion': settings.get('recursion', 1) > 1}
-    kept = {name: value for name, value in settings.items()
-            if name != 'method' and (name not in gone or value != gone[name])}
-    return kept | (method_fields(settings['method']) if 'method' in settings else {})

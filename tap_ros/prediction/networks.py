@@ -8,7 +8,7 @@ CPU `channels_last` is the faster one.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 import math
 
@@ -16,7 +16,6 @@ from tap_ros.errors import check_fields, ConfigError
 from tap_ros.images.crop import is_halved
 from tap_ros.prediction.methods import Decoder
 from tap_ros.prediction.warp import combine, warp
-from tap_ros.training.weights import LATER
 import torch
 from torch import nn
 from torch.nn import functional
@@ -49,8 +48,8 @@ class PredictorConfig:
     latent_size: int = 0
     new_pixels: bool = True
     flow_scale: float = 16.0
-    decoder: Decoder = field(default='separate', metadata=LATER)
-    skips: bool = field(default=False, metadata=LATER)
+    decoder: Decoder = 'separate'
+    skips: bool = False
 
     def __post_init__(self) -> None:
         """Refuse shapes that the network cannot have."""

@@ -4,11 +4,10 @@
 
 import contextlib
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from tap_ros.images.pixels import to_float
-from tap_ros.prediction.batches import Augmentation, Batch
+from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import (
     match_step,
     recursive_loss,
@@ -17,7 +16,7 @@ from tap_ros.prediction.losses import (
 )
 from tap_ros.prediction.networks import Prediction, PredictorNetwork
 from tap_ros.prediction.selection import selection_errors, Targets
-from tap_ros.prediction.training_config import ObjectiveSettings
+from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.prediction.training_networks import (
     discriminator_loss,
     generator_loss,
@@ -27,6 +26,9 @@ from tap_ros.prediction.training_networks import (
 )
 from tap_ros.training.devices import Autocast
 import torch
+
+GAN_WEIGHT = 5e-5  # of the GAN's terms beside the l1 error on [0, 1]
+LATENT_SIZE = 32  # length of z
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,19 @@ class Networks:
     :param discriminator: D_t (Eq. 11), which judges predictions from the prior (or without z), or
         None.
     :param posterior_discriminator: D'_t (Eq. 10), which judges those from the posterior, or None.
+    :param autocast: makes the context manager to run them in.
     """
 
     predictor: PredictorNetwork
     recognition: Recognition | None = None
     discriminator: torch.nn.Module | None = None
     posterior_discriminator: torch.nn.Module | None = None
+    autocast: Autocast = contextlib.nullcontext
+
+    def predict(self, context: torch.Tensor, z: torch.Tensor | None) -> Prediction:
+        """Return G(c, z) of contexts (B, C, 3, H, W)."""
+        with self.autocast():
+            return self.predictor(context, z)
 
 
 @dataclass(frozen=True)
@@ -52,9 +61,9 @@ class Draws:
     """
     The random numbers of one training step.
 
-    :param posterior: (B, T, latent_size) normal; one z for each target is used with the posterior
+    :param posterior: (B, T, LATENT_SIZE) normal; one z for each target is used with the posterior
         'frame', else the first.
-    :param prior: (B, latent_size) normal.
+    :param prior: (B, LATENT_SIZE) normal.
     :param other: (B, T) in 0..1, to draw t' of Eq. 11.
     """
 
@@ -63,21 +72,39 @@ class Draws:
     other: torch.Tensor
 
     @classmethod
-    def make(cls, batch: Batch, latent_size: int, seed: int, step: int) -> Self:
+    def make(cls, batch: Batch, seed: int, step: int) -> Self:
         """
         Draw those of a step, on the batch's device, the same ones whenever asked.
 
         :param batch: batches.Batch.
-        :param latent_size: of z.
         :param seed: of the training; step: number of the step.
         :return: Draws.
         """
         rng = np.random.default_rng([seed, 4, step])
         B, T = batch.times.shape
-        draws = (rng.standard_normal((B, T, latent_size), np.float32),
-                 rng.standard_normal((B, latent_size), np.float32),
+        draws = (rng.standard_normal((B, T, LATENT_SIZE), np.float32),
+                 rng.standard_normal((B, LATENT_SIZE), np.float32),
                  rng.random((B, T), np.float32))
         return cls(*(torch.from_numpy(draw).to(batch.times.device) for draw in draws))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """
+    What the discriminators learn from.
+
+    :param pairs: each discriminator, and the predictions (B, 3, H, W) that it judges.
+    :param context: (B, C, 3, H, W); real: (B, 3, H, W), the matched frames; other: likewise, of
+        other times.
+    :param step: int64 (B,), the outputs that the matched frames belong to; other_step: likewise.
+    """
+
+    pairs: list[tuple[torch.nn.Module, torch.Tensor]]
+    context: torch.Tensor
+    real: torch.Tensor
+    other: torch.Tensor
+    step: torch.Tensor
+    other_step: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -95,14 +122,12 @@ class Outcome:
     loss: torch.Tensor
     match: torch.Tensor
     parts: dict[str, torch.Tensor]
-    judged: dict[str, Any] | None = None
+    judged: Judged | None = None
     nats: torch.Tensor | None = None
 
 
-def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation | None,
-                   config: ObjectiveSettings, draws: Draws | None = None,
-                   autocast: Autocast = contextlib.nullcontext,
-                   kl_share: float = 1.0) -> Outcome:
+def predictor_loss(networks: Networks, batch: Batch, config: TrainingConfig,
+                   draws: Draws | None = None, kl_share: float = 1.0) -> Outcome:
     """
     Compute the predictor's training loss of a batch.
 
@@ -116,74 +141,62 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
     each with its weight. The GAN's terms stand at the matched frame, as in Eq. 10, and are left
     out of the choice.
 
-    :param draws: Draws; needed with GAN or VAE.
-    :param autocast: makes the context manager to run the networks in.
+    :param draws: needed with GAN or VAE.
     :param kl_share: of the weight of the KL divergence at this step, see training.kl_share.
     :return: Outcome.
     """
-    targets = Targets(batch, augmentation, config)
+    targets = Targets(batch, config)
     kl_weight = kl_share * config.kl_weight
-    context = to_float(batch.context)  # B, C, 3, H, W
-    context = augmentation.apply(context) if augmentation else context
     parts: dict[str, torch.Tensor] = {}
-    z = nats = None
+    z = nats = judged = None
     if networks.recognition is not None:
         assert draws is not None, 'z is drawn'
         if config.posterior == 'frame':
-            return _frame_posterior_loss(
-                networks, targets, context, config, draws, autocast, kl_weight)
+            return _frame_posterior_loss(networks, targets, draws, kl_weight)
         assert batch.video is not None, 'see Sampling.video_frames'
-        video = to_float(batch.video)
-        with autocast():
-            mean, log_variance = networks.recognition(
-                augmentation.apply(video) if augmentation else video)
+        with networks.autocast():
+            mean, log_variance = networks.recognition(targets.augmented(batch.video))
         z = sample_latent(mean, log_variance, draws.posterior[:, 0])
         nats = kl_divergence(mean, log_variance).mean()
         parts['kl'] = kl_weight * (nats - config.free_nats).clamp(min=0)
-    with autocast():
-        prediction = networks.predictor(context, z)
-    measured = targets.measured(context)
-    match = targets.match(prediction.image, measured)
+    prediction = networks.predict(targets.context, z)
+    match = targets.match(prediction.image, targets.measured)
     parts['error'] = targets.l1(prediction.image, match).mean()
-    judged = None
     if networks.discriminator is not None:
         assert draws is not None, "t' is drawn"
-        judged = _judge(networks, prediction, z, targets, context, match, draws, autocast)
-        with autocast():
-            verdicts = [judge(context, image) for judge, image in judged['pairs']]
-        parts['gan'] = config.gan_weight * total(
-            generator_loss(logits, judged['step']) for logits in verdicts)
+        judged = _judge(networks, targets, prediction, match, draws)
+        with networks.autocast():
+            verdicts = [judge(judged.context, image) for judge, image in judged.pairs]
+        parts['gan'] = GAN_WEIGHT * total(
+            generator_loss(logits, judged.step) for logits in verdicts)
     if config.recursion > 1:
         parts['error'] = _recursive_loss(
-            networks, prediction, targets, context, measured, match, parts['error'], config, z,
-            autocast)
+            networks, targets, prediction, match, parts['error'], z)
     return Outcome(total(parts.values()), match,
                    {name: value.detach() for name, value in parts.items()}, judged,
                    None if nats is None else nats.detach())
 
 
-def _judge(networks: Networks, prediction: Prediction, z: torch.Tensor | None, targets: Targets,
-           context: torch.Tensor, match: torch.Tensor, draws: Draws,
-           autocast: Autocast) -> dict[str, Any]:
+def _judge(networks: Networks, targets: Targets, prediction: Prediction, match: torch.Tensor,
+           draws: Draws) -> Judged:
     """Gather what the discriminators see of this batch."""
+    assert networks.discriminator is not None
     batch = targets.batch
     pairs = [(networks.discriminator, targets.visible(prediction.image))]
     if networks.posterior_discriminator is not None:
-        with autocast():
-            sampled = networks.predictor(context, draws.prior)
+        sampled = networks.predict(targets.context, draws.prior)
         pairs = [(networks.discriminator, targets.visible(sampled.image)),
                  (networks.posterior_discriminator, targets.visible(prediction.image))]
     chance = draws.other.masked_fill(~batch.valid, -1)
     chance[targets.rows, match] = -0.5  # t' is another frame, if there is one
     other = chance.argmax(1)
-    return {'pairs': pairs, 'context': context,
-            'real': targets.frame(match), 'other': targets.frame(other),
-            # The first output is for time 1: context and target are never the same frame.
-            'step': batch.times.gather(1, match[:, None])[:, 0] - 1,
-            'other_step': batch.times.gather(1, other[:, None])[:, 0] - 1}
+    # The first output is for time 1: context and target are never the same frame.
+    step, other_step = (batch.times.gather(1, at[:, None])[:, 0] - 1 for at in (match, other))
+    return Judged(pairs, targets.context, targets.frame(match), targets.frame(other), step,
+                  other_step)
 
 
-def discriminators_loss(judged: dict[str, Any],
+def discriminators_loss(judged: Judged,
                         autocast: Autocast = contextlib.nullcontext) -> torch.Tensor:
     """
     Compute the discriminators' own loss (Eq. 11), for predictions without gradient.
@@ -193,27 +206,25 @@ def discriminators_loss(judged: dict[str, Any],
     :return: scalar with gradient.
     """
     losses = []
-    for judge, image in judged['pairs']:
+    for judge, image in judged.pairs:
         with autocast():  # one batch each: batch norm must not mix real and generated frames
-            logits = [judge(judged['context'], frame)
-                      for frame in (judged['real'], image.detach(), judged['other'])]
-        real, generated, other = logits
-        losses.append(discriminator_loss(
-            real, generated, other, judged['step'], judged['other_step']))
+            real, generated, other = (judge(judged.context, frame) for frame in (
+                judged.real, image.detach(), judged.other))
+        losses.append(discriminator_loss(real, generated, other, judged.step, judged.other_step))
     return total(losses)
 
 
-def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets,
-                    context: torch.Tensor, measured: torch.Tensor, match: torch.Tensor,
-                    loss: torch.Tensor, config: ObjectiveSettings, z: torch.Tensor | None,
-                    autocast: Autocast) -> torch.Tensor:
+def _recursive_loss(networks: Networks, targets: Targets, prediction: Prediction,
+                    match: torch.Tensor, loss: torch.Tensor,
+                    z: torch.Tensor | None) -> torch.Tensor:
     """
     Add the levels r > 0 of Eq. 3.
 
     Unlike in the paper, no gradients flow through the predictions as contexts: else the loss of a
     later level bends a picture that serves for itself into one that is easy to go on from.
     """
-    batch, valid = targets.batch, targets.batch.valid
+    config, batch, valid = targets.config, targets.batch, targets.batch.valid
+    context, measured = targets.context, targets.measured
     losses, counts = [loss], [len(context)]
     for level in range(1, config.recursion):
         matched = batch.times.gather(1, match[:, None])
@@ -226,8 +237,7 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
         context, measured = (
             following if config.forward else torch.cat([pictures[:, :1], following], 1)
             for pictures in (context, measured))
-        with autocast():
-            prediction = networks.predictor(context, z)
+        prediction = networks.predict(context, z)
         # Preferences lie between the inputs of this level.
         between = replace(batch, valid=valid | ~left[:, None], preference=(
             None if batch.preference is None else batch.preference[:, level:]))
@@ -242,8 +252,7 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
     return recursive_loss(losses, counts)
 
 
-def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.Tensor,
-                          config: ObjectiveSettings, draws: Draws, autocast: Autocast,
+def _frame_posterior_loss(networks: Networks, targets: Targets, draws: Draws,
                           kl_weight: float) -> Outcome:
     """
     Compute the alternative of appendix B: the minimum over time of the whole CVAE loss.
@@ -257,20 +266,20 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
     B, T = batch.times.shape
     assert networks.recognition is not None
     divergences, errors = [], []
-    measured = targets.measured(context)
     for t in range(T):
         step = torch.full_like(targets.rows, t)
         frame = targets.frame(step)
-        with autocast():
-            mean, log_variance = networks.recognition(torch.cat([context, frame[:, None]], 1))
-            prediction = networks.predictor(
-                context, sample_latent(mean, log_variance, draws.posterior[:, t]))
+        with networks.autocast():
+            mean, log_variance = networks.recognition(
+                torch.cat([targets.context, frame[:, None]], 1))
+            z = sample_latent(mean, log_variance, draws.posterior[:, t])
+        prediction = networks.predict(targets.context, z)
         divergences.append(kl_divergence(mean, log_variance))
         errors.append(targets.l1(prediction.image, step))
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
     whole = (kl_weight * divergences + errors).detach()
     match = match_step(selection_errors(
-        whole, lambda: targets.errors(measured), batch, config), batch.valid)
+        whole, lambda: targets.errors(targets.measured), batch, targets.config), batch.valid)
     nats, error = (values.gather(1, match[:, None]).mean()
                    for values in (divergences, errors))
     parts = {'kl': kl_weight * nats, 'error': error}

@@ -7,13 +7,13 @@ import math
 
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction import losses
-from tap_ros.prediction.batches import Augmentation, Batch
-from tap_ros.prediction.training_config import ObjectiveSettings
+from tap_ros.prediction.batches import Batch
+from tap_ros.prediction.training_config import TrainingConfig
 import torch
 
 
 def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor], batch: Batch,
-                     config: ObjectiveSettings) -> torch.Tensor:
+                     config: TrainingConfig) -> torch.Tensor:
     """
     Compute E'_t of Eq. 5 for the configured method: E_t / w(t) in the paper (section 3.2).
 
@@ -45,27 +45,26 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
 
 class Targets:
     """
-    The frames of a batch that predictions are compared with.
+    The frames of a batch that predictions are compared with, and what predictions come from.
 
-    :param augmentation: Augmentation of all pictures that networks see, or None.
+    :ivar context: (B, C, 3, H, W) in [-1, 1], augmented.
+    :ivar measured: the same as errors are measured with it, see Batch.measured.
     """
 
-    def __init__(self, batch: Batch, augmentation: Augmentation | None,
-                 config: ObjectiveSettings) -> None:
-        self.batch, self.augmentation, self.config = batch, augmentation, config
+    def __init__(self, batch: Batch, config: TrainingConfig) -> None:
+        self.batch, self.augmentation, self.config = batch, batch.augmentation, config
         self.rows = torch.arange(len(batch.context), device=batch.context.device)
+        self.context = self.augmented(batch.context)
+        self.measured = self.context if batch.bare is None else self.augmented(batch.bare)
+
+    def augmented(self, pictures: torch.Tensor) -> torch.Tensor:
+        """Return pictures, uint8 (B, N, H, W, 3), as networks see them, (B, N, 3, H, W)."""
+        images = to_float(pictures)
+        return self.augmentation.apply(images) if self.augmentation else images
 
     def frame(self, step: torch.Tensor) -> torch.Tensor:
         """Return the augmented frames (B, 3, H, W) at indices step (B,) into T."""
-        frame = to_float(self.batch.targets[self.rows, step])[:, None]
-        return (self.augmentation.apply(frame) if self.augmentation else frame)[:, 0]
-
-    def measured(self, context: torch.Tensor) -> torch.Tensor:
-        """Return the augmented context that errors are measured with, Batch.measured."""
-        if self.batch.bare is None:
-            return context
-        bare = to_float(self.batch.bare)
-        return self.augmentation.apply(bare) if self.augmentation else bare
+        return self.augmented(self.batch.targets[self.rows, step][:, None])[:, 0]
 
     def visible(self, image: torch.Tensor) -> torch.Tensor:
         """Return augmented pictures (B, 3, H, W), black where targets are, see Batch.visible."""
@@ -85,7 +84,7 @@ class Targets:
         than applying it to all targets.
 
         :param image: (B, 3, H, W), predictions, augmented.
-        :param context: (B, C, 3, H, W), what they come from, as measured returns it.
+        :param context: (B, C, 3, H, W), what they come from, as errors are measured with it.
         :param batch: with the valid targets and the bounds of the preference, where these are not
             the batch's own.
         :return: int64 (B,), indices into T.

@@ -6,7 +6,7 @@ The state of a training run, and its way to a file and back.
 Batches and augmentation are drawn from (seed, step), so that there are no random numbers in it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 import copy
 from dataclasses import dataclass, field
 import json
@@ -17,13 +17,15 @@ from typing import Any, Generic, TypeVar
 from tap_ros.errors import ConfigError, WeightsError
 from tap_ros.text import escaped
 from tap_ros.training.devices import placed
-from tap_ros.training.settings import FREE
+from tap_ros.training.run_config import FREE
 from tap_ros.training.weights import load_tensors, save_tensors
 import torch
 
 Trained = TypeVar('Trained', bound=torch.nn.Module)
 
 DISCRIMINATOR_RATE = 2e-4
+WARMUP = 100  # steps over which the learning rate rises
+GRADIENT_CLIP = 1.0  # largest norm of the gradient
 _REMEDY = 'remove it to begin anew, or choose another --out folder'
 
 
@@ -36,6 +38,7 @@ class TrainingState(Generic[Trained]):
     :param average: moving average of its weights, in eval mode; what is shipped.
     :param helpers: ModuleDict of the networks that only training needs: recognition,
         discriminators; may be empty.
+    :param average_decay: share of the average that stays at a step, 0..1.
     :param optimizers: list of Adams: of the network with what is trained along with it, and, if
         there are discriminators, theirs.
     :param step: number of steps done.
@@ -48,6 +51,7 @@ class TrainingState(Generic[Trained]):
     network: Trained
     average: Trained
     helpers: torch.nn.ModuleDict
+    average_decay: float
     optimizers: list[torch.optim.Optimizer]
     step: int = 0
     seconds: float = 0.0
@@ -62,31 +66,27 @@ class TrainingState(Generic[Trained]):
             self.best_score, self.best_step = score, self.step
             self.best = {name: value.clone() for name, value in self.average.state_dict().items()}
 
-    def set_rates(self, steps: int, warmup: int) -> None:
+    def set_rates(self, steps: int) -> None:
         """
         Set this step's learning rates: a linear rise, then half a cosine down to 2 %.
 
-        :param steps: length of the training; warmup: steps of the rise.
+        :param steps: length of the training.
         """
-        rise = min(1.0, (self.step + 1) / (warmup + 1))
+        rise = min(1.0, (self.step + 1) / (WARMUP + 1))
         fall = 0.5 + 0.5 * math.cos(math.pi * self.step / steps)
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
                 group['lr'] = optimizer.defaults['lr'] * rise * (0.02 + 0.98 * fall)
 
-    def clip_gradients(self, most: float) -> torch.Tensor:
-        """Scale the network's gradients down to the norm `most`, 0: any; return what it was."""
+    def clip_gradients(self) -> torch.Tensor:
+        """Scale the network's gradients down to GRADIENT_CLIP; return the norm that they had."""
         return torch.nn.utils.clip_grad_norm_(
-            self.optimizers[0].param_groups[0]['params'], most or math.inf)
+            self.optimizers[0].param_groups[0]['params'], GRADIENT_CLIP)
 
     @torch.no_grad()
-    def update_average(self, decay: float) -> None:
-        """
-        Move the average towards the network; faster at the beginning.
-
-        :param decay: share of the average that stays, 0..1.
-        """
-        decay = min(decay, (1 + self.step) / (10 + self.step))
+    def update_average(self) -> None:
+        """Move the average towards the network; faster at the beginning."""
+        decay = min(self.average_decay, (1 + self.step) / (10 + self.step))
         averages: list[torch.Tensor] = list(self.average.parameters())
         weights: list[torch.Tensor] = list(self.network.parameters())
         torch._foreach_lerp_(averages, weights, 1 - decay)
@@ -95,12 +95,14 @@ class TrainingState(Generic[Trained]):
 
 
 def start(network: Trained, learning_rate: float, device: torch.device,
+          average_decay: float,
           helpers: Mapping[str, torch.nn.Module] | None = None) -> TrainingState[Trained]:
     """
     Begin a training run.
 
     :param network: with fresh weights.
     :param learning_rate: of Adam at its highest; of discriminators it is DISCRIMINATOR_RATE.
+    :param average_decay: share of the average of the weights that stays at a step, 0..1.
     :param helpers: dict of the networks that only training needs. Those whose name ends in
         'discriminator' are trained against the others.
     :return: TrainingState.
@@ -116,7 +118,7 @@ def start(network: Trained, learning_rate: float, device: torch.device,
     optimizers: list[torch.optim.Optimizer] = [
         torch.optim.Adam(group, rate, betas, fused=True)
         for group, rate in zip(groups, (learning_rate, DISCRIMINATOR_RATE)) if group]
-    return TrainingState(network, average, helpers, optimizers)
+    return TrainingState(network, average, helpers, average_decay, optimizers)
 
 
 def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mapping[str, Any],
@@ -143,7 +145,7 @@ def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
 
 
 def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mapping[str, Any],
-                    data_hash: str, todays: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+                    data_hash: str) -> None:
     """
     Put the state of a run back.
 
@@ -151,7 +153,6 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     :param state: TrainingState as start made it; changed in place.
     :param settings: dict of the run's settings.
     :param data_hash: of the recordings.
-    :param todays: makes settings of earlier versions into those of today.
     :raises ConfigError: if the checkpoint is of other settings or other recordings.
     :raises WeightsError: if it is damaged, or no checkpoint of such a network.
     """
@@ -160,9 +161,12 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     tensors, about = load_tensors(path)
     if about.get('kind') != 'checkpoint':
         raise WeightsError(f'{escaped(path)}: is no checkpoint; {_REMEDY}')
-    begun, settings = json.loads(json.dumps([todays(about['settings']), settings]))  # no tuples
-    for name in {**begun, **settings}:
-        before, value = begun.get(name), settings.get(name)
+    begun, settings = json.loads(json.dumps([about['settings'], settings]))  # no tuples
+    if begun.keys() != settings.keys():
+        raise ConfigError(f'{escaped(path)}: made by another version of tap_ros, which has other '
+                          'settings; go on with that one, or choose another --out folder')
+    for name, value in settings.items():
+        before = begun[name]
         if name not in FREE and before != value:
             raise ConfigError(
                 f'{escaped(path)}: made with {name}={escaped(repr(before))}, not {value!r}; to go '
@@ -176,7 +180,7 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
         raise WeightsError(f'{escaped(path)}: is a checkpoint of something else '
                            f'({escaped(error)}); {_REMEDY}') from error
     state.step, state.seconds = about['step'], about['seconds']
-    state.precision = about.get('precision', '')
+    state.precision = about['precision']
     state.best_score, state.best_step = about.get('best', (math.inf, 0))
 
 

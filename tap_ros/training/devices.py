@@ -59,8 +59,3 @@ def pick_precision(precision: str, device: torch.device) -> str:
 def make_autocast(precision: str, device: torch.device) -> Autocast:
     """Return what makes a context manager to run networks in, for 'float32' or 'bfloat16'."""
     return partial(torch.autocast, device.type, torch.bfloat16, enabled=precision == 'bfloat16')
-
-
-def device_name(device: torch.device) -> str:
-    """Say what computes: 'cpu', or the name of the GPU."""
-    return torch.cuda.get_device_name(device) if device.type == 'cuda' else device.type

@@ -25,8 +25,6 @@ import torch
 Config = TypeVar('Config')  # a dataclass
 Network = TypeVar('Network', bound=torch.nn.Module)
 
-LATER = {'later': True}  # metadata of a field that files of earlier versions lack
-
 _FORMAT = 'tap_ros 2'  # 1 had no SHA-256
 _AGAIN = 'copy it again, or train again'
 
@@ -81,17 +79,14 @@ def make_network(network_class: Callable[[Config], Network], config_class: type[
     Make the network of a file, with its weights.
 
     :param network_class: takes the configuration.
-    :param config_class: its dataclass. Files of earlier versions lack the fields whose metadata
-        says LATER.
+    :param config_class: its dataclass.
     :param values: configuration dict of load_weights; state: its state dict.
     :param path: the file, for messages.
     :return: the network, in float32, on the CPU.
     :raises WeightsError: if the configuration cannot be used, or the weights do not fit it.
     """
-    described = fields(config_class)  # type: ignore[arg-type]
-    known = {field.name for field in described}
-    needed = {field.name for field in described if not LATER.items() <= field.metadata.items()}
-    unknown, missing = sorted(set(values) - known), sorted(needed - set(values))
+    known = {field.name for field in fields(config_class)}  # type: ignore[arg-type]
+    unknown, missing = sorted(set(values) - known), sorted(known - set(values))
     if unknown or missing:
         what = f'unknown configuration {listing(unknown)}' if unknown else (
             f'lacks the configuration {listing(missing)}')

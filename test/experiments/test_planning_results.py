@@ -7,6 +7,7 @@ from functools import partial
 import json
 from pathlib import Path
 
+from experiments.__main__ import LINE
 from experiments.planning import runs
 from experiments.planning.methods import parse_method
 from experiments.planning.results import make_rows, make_stack_rows
@@ -114,7 +115,7 @@ def test_results_of_other_settings_are_not_subtracted():
         assert not any('against' in row for row in make_rows(results))
     results = dict([stored('direct', [9.0]), stored('direct:steps60', [4.0])])
     assert {r['compares'] for r in make_rows(results) if 'against' in r} == {'step_budget'}
-    results = dict([stored('genmin', [9.0]), stored('genmin:carried', [4.0])])
+    results = dict([stored('genmin', [9.0]), stored('genmin:tracked', [4.0])])
     assert any('against' in row for row in make_rows(results))
     results['push2', 'genmin'][0]['predictor_weights'] = 'others'
     assert not any('against' in row for row in make_rows(results))
@@ -124,23 +125,23 @@ def test_the_command_leaves_numbers_and_films_and_runs_nothing_again(
         tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(runs, 'run_tasks', run_here)
     out = tmp_path / 'results'
-    words = ['evaluate', 'planning', '--tasks', 'push2', 'stack2', '--methods', 'nothing',
-             'direct:steps2', 'shipped:carried:steps2', '--scenes', '1',
+    words = ['planning', '--tasks', 'push2', 'stack2', '--methods', 'nothing',
+             'direct:steps2', 'shipped:tracked:steps2', '--scenes', '1',
              '--out', str(out), '--preset', 'quick', '--solver', 'icem']
-    assert main(words) == 0
+    assert main(words, LINE) == 0
     rows = json.loads((out / 'planning.json').read_text())
     assert {row['method'] for row in rows} == {
-        'nothing', 'direct:steps2', 'shipped:carried:steps2'}
-    carried = [row for row in rows if row['method'] == 'shipped:carried:steps2']
-    assert {row['step_budget'] for row in carried} == {2}
-    assert {row['tracking'] for row in carried} == {'carried'}
-    assert 'tracking_error_px' in {row['metric'] for row in carried}
-    assert '--methods shipped:carried:steps2 --scenes 1' in carried[0]['command']
-    assert '--solver icem' in carried[0]['command']
+        'nothing', 'direct:steps2', 'shipped:tracked:steps2'}
+    tracked = [row for row in rows if row['method'] == 'shipped:tracked:steps2']
+    assert {row['step_budget'] for row in tracked} == {2}
+    assert {row['tracking'] for row in tracked} == {'rigid'}
+    assert 'tracking_error_px' in {row['metric'] for row in tracked}
+    assert '--methods shipped:tracked:steps2 --scenes 1' in tracked[0]['command']
+    assert '--solver icem' in tracked[0]['command']
     for film in ('planning/push2-direct--steps2.png', 'stacking/stack2-direct--steps2.png'):
         assert (out / film).read_bytes().startswith(b'\x89PNG')
     files = {path: path.stat().st_mtime_ns for path in out.rglob('*-*.json')}
-    assert main([*words, '--no-films']) == 0 and main([*words, '--results-only']) == 0
+    assert main([*words, '--no-films'], LINE) == 0 and main([*words, '--results-only'], LINE) == 0
     assert files == {path: path.stat().st_mtime_ns for path in files}  # nothing is run again
-    assert main([*words, '--methods', 'unheard_of']) == 1
+    assert main([*words, '--methods', 'unheard_of'], LINE) == 1
     assert '--predictor unheard_of=FILE' in capsys.readouterr().err

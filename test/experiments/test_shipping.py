@@ -9,24 +9,27 @@ import numpy as np
 import pytest
 from tap_ros.cli import main
 from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.training.recipes import Recipe, RECIPES
+from tap_ros.prediction.training_config import RECIPES, TrainingConfig
 from tap_ros.weights import PREDICTORS
 
-TINY = Recipe({'selection': 'absolute', 'steps': 2, 'batch_size': 2, 'base_width': 4,
-               'goal_picture': 'last', 'latent': 'vae', 'test_fraction': 0.5},
-              'grasp', {'grasp': {'episodes': 6},
-                        'light': {'episodes': 2, 'appearance': 'lighter_table'}})
+TINY = TrainingConfig(
+    recordings=(), selection='absolute', steps=2, batch_size=2, base_width=4, goal_picture='last',
+    latent='vae', test_fraction=0.5)
+RECORDED = 'grasp', {'grasp': {'episodes': 6},
+                     'light': {'episodes': 2, 'appearance': 'lighter_table'}}
 
 
 @pytest.fixture
 def places(tmp_path, monkeypatch):
-    monkeypatch.setitem(RECIPES['predictor'], 'tiny', TINY)
+    monkeypatch.setitem(RECIPES, 'tiny', TINY)
     monkeypatch.setattr(command, 'FRESH_EPISODES', 3)
     return {'bags': str(tmp_path / 'bags'), 'runs': str(tmp_path / 'runs'),
             'out': str(tmp_path / 'out')}
 
 
-def test_weights_are_made_from_nothing_and_their_card_says_how(places, capfd):
+def test_weights_are_made_from_nothing_and_their_card_says_how(
+        places, monkeypatch, capfd):
+    monkeypatch.setitem(command.SHIPPED, 'tiny', RECORDED)
     options = command.Options(only=('tiny',), **places)
     command.run(options)
     file, source = (Path(places['out'], 'predictor_tiny.safetensors'),
@@ -58,7 +61,7 @@ def test_the_list_is_of_commands_that_exist(places, capsys):
     command.run(command.Options(list=True, **places))
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == sum(
-        2 + len(RECIPES['predictor'][name].recordings) for name in command.SHIPPED)
+        2 + len(recordings) for _, recordings in command.SHIPPED.values())
     assert not Path(places['runs']).exists()
     for line in lines:
         words = line.split()[3:]

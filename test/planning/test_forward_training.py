@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file
 from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.planning.forward_loss import forward_loss, make_windows
+from tap_ros.planning.forward_loss import (
+    Cuts,
+    forward_loss,
+    make_windows,
+    OBJECT_WEIGHT,
+    STILL_WEIGHT,
+)
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_training import model_config, train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
@@ -17,6 +23,7 @@ from tap_ros.planning.table import project
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.inpainted import FilledStore
 from tap_ros.training.robot_mask import fill_from_past
+from tap_ros.training.weights import save_weights
 import torch
 from toy_world import ARM, make_episode, SIZE, TABLE, to_pixels
 
@@ -25,17 +32,15 @@ HOMOGRAPHY = torch.tensor(TABLE).view(3, 3)
 
 def windows(mirrored, order=0, seed=3, steps=4):
     store = [make_episode(seed)]
-    return make_windows(
-        store, [0], [2], steps, HOMOGRAPHY, np.array([mirrored]), [order]), store[0]
+    return make_windows(store, Cuts([0], [2], steps, mirrored, order), HOMOGRAPHY), store[0]
 
 
 def test_windows_without_the_gripper_are_refused_by_the_number_of_their_episode():
     store = [make_episode(seed) for seed in (1, 2, 3)]
     store[2].grippers[3, 0] = np.nan
-    plain = HOMOGRAPHY, np.zeros(3, bool), [0] * 3
-    assert len(make_windows(store, [0, 1, 2], [2, 2, 4], 4, *plain).images) == 3
+    assert len(make_windows(store, Cuts([0, 1, 2], [2, 2, 4], 4), HOMOGRAPHY).images) == 3
     with pytest.raises(RecordingError, match='episode 2 lacks gripper positions'):
-        make_windows(store, [0, 1, 2], [2, 2, 0], 4, *plain)
+        make_windows(store, Cuts([0, 1, 2], [2, 2, 0], 4), HOMOGRAPHY)
 
 
 def test_mirrored_windows_show_objects_where_the_mirrored_table_says():
@@ -49,31 +54,31 @@ def test_mirrored_windows_show_objects_where_the_mirrored_table_says():
     torch.testing.assert_close(flipped.actions[..., 0], -plain.actions[..., 0])
 
 
-def test_the_loss_is_that_of_the_chosen_pictures_and_what_moves_costs_a_little(model):
+def test_the_loss_is_that_of_the_chosen_pictures_and_what_moves_costs_a_little(
+        model, monkeypatch):
     batch, _ = windows(False)
-    config = ForwardTrainingConfig(
-        recordings=('x',), out='x', still_weight=0.5, object_weight=0.25)
-    forward_loss(model, batch, {2, 4}, config)[0].backward()
+    forward_loss(model, batch, {2, 4})[0].backward()
     assert all(p.grad is not None and p.grad.any() for p in model.parameters())
-    losses = {steps: forward_loss(model, batch, set(steps), config)
+    losses = {steps: forward_loss(model, batch, set(steps))
               for steps in ((1,), (4,), (1, 4))}
     for loss, parts in losses.values():
         assert 0 < parts['moving'] < 1
         assert 0 < parts['objects'] < 1
         assert float(loss) == pytest.approx(
-            parts['picture'] + 0.5 * parts['moving'] + 0.25 * parts['objects'])
+            parts['picture'] + STILL_WEIGHT * parts['moving']
+            + OBJECT_WEIGHT * parts['objects'])
     first, last, both = (parts for _, parts in losses.values())
     assert both['picture'] == pytest.approx((first['picture'] + last['picture']) / 2)
     with torch.no_grad():
         model.push.masks.bias.copy_(torch.tensor([0, 0, 50.0]))  # says that all stays
-    assert forward_loss(model, batch, {1}, config)[1]['moving'] == pytest.approx(0, abs=1e-6)
-    even = forward_loss(model, batch, {4}, replace(config, motion_factor=0.0))[1]['picture']
-    assert even < last['picture']
+    assert forward_loss(model, batch, {1})[1]['moving'] == pytest.approx(0, abs=1e-6)
+    monkeypatch.setattr('tap_ros.planning.forward_loss.MOTION_FACTOR', 0.0)
+    assert forward_loss(model, batch, {4})[1]['picture'] < last['picture']
 
 
 def test_the_table_is_where_a_given_camera_sees_it_and_the_arm_must_be_where_it_says():
     store = Store(map(make_episode, range(8)))
-    config = ForwardTrainingConfig(recordings=('x',), out='x', crop='4,2,24', size=16,
+    config = ForwardTrainingConfig(recordings=('x',), crop='4,2,24', size=16,
                                    projection=(*ARM[:2], 3.0, *ARM[3:]))
     made = model_config(config, store, np.arange(8))
     points = torch.tensor([[0.1, -0.2], [0.0, 0.1]], dtype=torch.float64)
@@ -85,7 +90,7 @@ def test_the_table_is_where_a_given_camera_sees_it_and_the_arm_must_be_where_it_
     with pytest.raises(RecordingError, match='px from where its gripper positions'):
         model_config(config, store, np.arange(8))
     with pytest.raises(ConfigError, match='projection: expected 12 numbers'):
-        replace(config, projection=(1.0,))
+        replace(config, projection=(1.0,)).check()
 
 
 class Store(list):
@@ -100,8 +105,8 @@ class Store(list):
 
 def config_for(bag, out, **changes):
     config = ForwardTrainingConfig(
-        recordings=(str(bag),), out=str(out), steps=4, batch_size=2, horizon=3, pictures=2,
-        width=16, features=4, warmup=2, test_fraction=0.1, device='cpu', threads=1, save_every=2,
+        recordings=(str(bag),), out=str(out), steps=4, batch_size=2, pictures=2,
+        test_fraction=0.1, device='cpu', threads=1, save_every=2,
         log_every=2)
     return replace(config, **changes)
 
@@ -119,8 +124,11 @@ def test_resumed_training_equals_uninterrupted_training(bag, tmp_path):
     begun = load_file(train(config_for(bag, tmp_path / 'c', **begins), progress=False))
     for name, value in first.items():
         assert torch.allclose(begun[name], value, atol=1e-6) == (name != 'sprite'), name
+    narrow = ForwardModelConfig(TABLE, ARM, image_size=SIZE, width=8)
+    save_weights(tmp_path / 'narrow', LearnedForwardModel(narrow), 'forward_model', narrow, {})
     with pytest.raises(ConfigError, match='for another network'):
-        train(config_for(bag, tmp_path / 'd', width=8, **begins), progress=False)
+        train(config_for(bag, tmp_path / 'd', **begins | {
+            'initial_weights': str(tmp_path / 'narrow')}), progress=False)
 
 
 @pytest.fixture(scope='module')
@@ -135,7 +143,7 @@ def masked_windows(bag, robot_mask, mirrored):
     """Return windows of the third frame on, first pictures filled as FreeView does."""
     store = FilledStore(open_recordings([bag], progress=False), robot_mask,
                         filling=fill_from_past)
-    return make_windows(store, [0, 1], [2, 3], 4, HOMOGRAPHY, np.array([mirrored] * 2), [1, 2],
+    return make_windows(store, Cuts([0, 1], [2, 3], 4, mirrored, np.array([1, 2])), HOMOGRAPHY,
                         robot_mask)
 
 
@@ -144,7 +152,7 @@ def learn(batch, robot_mask='all'):
     torch.manual_seed(0)
     model = LearnedForwardModel(ForwardModelConfig(
         TABLE, ARM, image_size=SIZE, width=16, robot_mask=robot_mask))
-    loss, _ = forward_loss(model, batch, {1, 3, 4}, ForwardTrainingConfig(('x',), 'x'))
+    loss, _ = forward_loss(model, batch, {1, 3, 4})
     loss.backward()
     return [loss.detach(), *(p.grad for p in model.parameters() if p.grad is not None)]
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the shipped forward model is good for: recorded pushes, and following objects by it."""
+"""What the shipped forward model is good for: recorded pushes."""
 
 from dataclasses import replace
 from itertools import islice
@@ -10,13 +10,10 @@ from pathlib import Path
 from made_episodes import write_bag
 import numpy as np
 import pytest
-from sim_bridge.simulator import Simulator
 from tap_ros.cli import main
-from tap_ros.planning.carried_tracker import CarriedTracker
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.forward_scores import held_out_scores
 from tap_ros.recording.cache import open_recordings
-from tap_ros.tracking.protocols import View
 from tap_ros.weights import FORWARD_MODEL
 
 SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
@@ -55,30 +52,3 @@ def test_without_object_pixels_pictures_are_compared_with_copying(model, tmp_pat
         if metric == 'changed_l1':
             assert told[f'changed_copying_l1_{step}'] > told[f'changed_picture_l1_{step}'] > 0
             assert row['value'] > 3 * rows['picture_l1', method, step]['value']
-
-
-def push(simulator, seed):
-    """Push object 0 towards the middle; yield what was seen before, the action, and after."""
-    seen = simulator.reset(seed)
-    target = seen.object_poses[0, :2]
-    along = -target / np.linalg.norm(target)
-    behind = target - 0.13 * along
-    actions = [[0, 0, 0.13 - seen.gripper[2], 0]]
-    actions += [[*(behind - seen.gripper[:2]) / 12, 0, 0]] * 12
-    actions += [[0, 0, -0.118, 0]] + [[*0.035 * along, 0, 0]] * 7
-    for action in np.array(actions, np.float32):
-        before, seen = seen, simulator.step(action)
-        yield before, action, seen
-
-
-def test_a_pushed_object_is_followed_by_its_first_pixel():
-    simulator, tracker = Simulator('push2'), CarriedTracker()
-    for before, _, seen in push(simulator, 31):
-        if before.stamp_ns == 0:
-            first = before.object_pixels
-            tracker.select(View(before.image, None, before.gripper), first)
-        tracked = tracker.update(View(seen.image, None, seen.gripper))
-    simulator.close()
-    errors = np.linalg.norm(tracked.pixels - seen.object_pixels, axis=1)
-    assert np.linalg.norm(first - seen.object_pixels, axis=1).max() > 4
-    assert np.mean(errors) < 1.0 and np.max(errors) < 2.5

@@ -100,7 +100,7 @@ def test_each_pass_has_every_episode_once():
 
 
 def test_augmentation_can_be_undone_and_is_the_same_for_all_pictures_of_an_episode():
-    augmentation = Augmentation.draw(16, True, True, 0.3, np.random.default_rng(0))
+    augmentation = Augmentation.draw(16, True, 0.3, np.random.default_rng(0))
     images = torch.rand(16, 2, 3, 8, 8) * 2 - 1
     changed = augmentation.apply(images)
     assert not changed.allclose(images)

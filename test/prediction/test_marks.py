@@ -85,9 +85,9 @@ def test_marks_of_something_else_are_refused_with_the_file_and_the_reason(bag, s
 
 def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_path, capsys):
     config = TrainingConfig(
-        (str(bag),), str(tmp_path / 'run'), base_width=4, batch_size=4, steps=4, margin=1,
-        test_fraction=0.3, threads=1, save_every=2, precision='float32', selection='marks',
-        marks=str(marks))
+        recordings=(str(bag),), out=str(tmp_path / 'run'), base_width=4, batch_size=4, steps=4,
+        margin=1, test_fraction=0.3, threads=1, save_every=2, precision='float32',
+        selection='marks', marks=str(marks))
     about = load_weights(train(config, stop_at=2, progress=False), 'predictor')[2]
     told = capsys.readouterr().err
     assert 'demonstrations. Learned from the others, a mark is found within one' in told
@@ -107,7 +107,7 @@ def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_p
             train(replace(config, out=str(tmp_path / 'other'), **values), progress=False)
     for values in ({'marks': ''}, {'loss': 'min'}, {'selection': 'relative'}):
         with pytest.raises(ConfigError, match='^marks'):
-            replace(config, **values)
+            replace(config, **values).check()
     with pytest.raises(ConfigError, match='mark some of those that are not held out'):
         learn_marks(store, read_marks(marks, store), np.array([23]), 1, False, 'none')
 

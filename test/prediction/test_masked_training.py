@@ -7,11 +7,17 @@ from dataclasses import replace
 from made_episodes import cover, write_bag
 import numpy as np
 import pytest
-from tap_ros.prediction.batches import Augmentation, make_batch, Sampling
+from tap_ros.prediction.batches import Augmentation, make_batch, Pictures, Sampling
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
-from tap_ros.prediction.objective import discriminators_loss, Draws, Networks, predictor_loss
-from tap_ros.prediction.training_config import ObjectiveSettings
+from tap_ros.prediction.objective import (
+    discriminators_loss,
+    Draws,
+    LATENT_SIZE,
+    Networks,
+    predictor_loss,
+)
+from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.prediction.training_networks import Discriminator, Recognition
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.inpainted import fill
@@ -34,7 +40,7 @@ def batches(bags, robot_mask, **sampling):
     for bag in bags:
         store = open_recordings([bag], progress=False)
         found.append(make_batch(store, CHOSEN, Sampling(margin=1, video_frames=4, **sampling),
-                                filled=fill(store, robot_mask)))
+                                pictures=Pictures(filled=fill(store, robot_mask))))
     return found[0], replace(found[1], context=found[0].context)
 
 
@@ -43,7 +49,7 @@ def networks(settings, images=4):
     torch.manual_seed(0)
     vae = settings.latent == 'vae'
     config = PredictorConfig(image_size=32, base_width=4, num_context=2,
-                             latent_size=3 if vae else 0, new_pixels=True)
+                             latent_size=LATENT_SIZE if vae else 0, new_pixels=True)
     return Networks(
         PredictorNetwork(config), Recognition(config, images) if vae else None,
         Discriminator(config, 12) if settings.gan else None,
@@ -53,16 +59,16 @@ def networks(settings, images=4):
 def learn(batch, config):
     """Return loss, match and the gradients of all networks."""
     nets = networks(config, 4 if config.posterior == 'video' else 3)
-    augmentation = Augmentation.draw(len(CHOSEN), True, True, 0.2, np.random.default_rng(1))
+    augmentation = Augmentation.draw(len(CHOSEN), True, 0.2, np.random.default_rng(1))
     assert augmentation.flip.any() and not augmentation.flip.all()
-    outcome = predictor_loss(nets, batch, augmentation, config, Draws.make(
-        batch, 3, 0, 0))
+    batch = replace(batch, augmentation=augmentation)
+    outcome = predictor_loss(nets, batch, config, Draws.make(batch, 0, 0))
     loss = outcome.loss
     if outcome.judged is not None:
         loss = loss + discriminators_loss(outcome.judged)
     loss.backward()
     return [outcome.loss.detach(), outcome.match, *(
-        parameter.grad for net in vars(nets).values() if net is not None
+        parameter.grad for net in vars(nets).values() if isinstance(net, torch.nn.Module)
         for parameter in net.parameters() if parameter.grad is not None)]
 
 
@@ -70,7 +76,7 @@ def learn(batch, config):
     {'selection': 'progress'}, {'selection': 'relative', 'recursion': 2},
     method_fields('genmin-vae-gan'), {**method_fields('genmin-vae'), 'posterior': 'frame'}])
 def test_what_the_robot_looks_like_changes_nothing(bags, values):
-    config = ObjectiveSettings(**values)
+    config = TrainingConfig(recordings=(), **values)
     one, other = (learn(batch, config) for batch in batches(bags, 'all'))
     assert len(one) == len(other) > 10
     assert all(a.equal(b) for a, b in zip(one, other))
@@ -84,8 +90,8 @@ def test_a_share_of_the_context_pictures_is_filled(bags):
     share, store = 0.5, open_recordings([bags[0]], progress=False)
     filled = fill(store, 'all')
     chosen = np.arange(8).repeat(8)
-    batch = make_batch(store, chosen, Sampling(fill_context=share), filled=filled,
-                       rng=np.random.default_rng(0))
+    batch = make_batch(store, chosen, Sampling(fill_context=share), np.random.default_rng(0),
+                       Pictures(filled=filled))
     shown = np.array([(context.numpy() == filled.frames([i], np.array([[0]]))[0, 0].numpy()).all()
                       for i, context in zip(chosen, batch.context[:, 0])])
     assert abs(shown.mean() - share) < 0.2

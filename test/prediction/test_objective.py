@@ -14,13 +14,14 @@ from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.objective import (
     discriminators_loss,
     Draws,
+    GAN_WEIGHT,
     Networks,
     predictor_loss,
 )
-from tap_ros.prediction.training_config import ObjectiveSettings
+from tap_ros.prediction.training_config import TrainingConfig
 import torch
 
-CONFIG = ObjectiveSettings(selection='relative', progress_margin=0.0)
+CONFIG = TrainingConfig(recordings=(), selection='relative', progress_margin=0.0)
 
 
 class Showing(torch.nn.Module):
@@ -63,7 +64,7 @@ def test_each_loss_is_the_error_at_the_frame_that_it_chooses():
                              w[:, 0, :4].argmax(1)),
                             ({'selection': 'still'}, still),
                             ({'selection': 'absolute'}, preferred)):  # Eq. 5
-        outcome = predictor_loss(showing(image), batch, None, replace(CONFIG, **settings))
+        outcome = predictor_loss(showing(image), batch, replace(CONFIG, **settings))
         assert outcome.match.equal(match), settings
         expected = errors.gather(1, match[:, None]).mean()  # not weighted by the preference
         assert outcome.loss.item() == pytest.approx(expected.item(), abs=1e-6)
@@ -72,12 +73,13 @@ def test_each_loss_is_the_error_at_the_frame_that_it_chooses():
 def test_augmentation_does_not_change_the_choice():
     batch = make_batch(B=16)
     image = to_float(batch.targets).mean(1)
-    augmentation = Augmentation.draw(16, True, True, 0.2, np.random.default_rng(0))
-    plain = predictor_loss(showing(image), batch, None, CONFIG)
-    changed = predictor_loss(showing(image, augmentation), batch, augmentation, CONFIG)
+    augmentation = Augmentation.draw(16, True, 0.2, np.random.default_rng(0))
+    plain = predictor_loss(showing(image), batch, CONFIG)
+    batch = replace(batch, augmentation=augmentation)
+    changed = predictor_loss(showing(image, augmentation), batch, CONFIG)
     assert changed.match.equal(plain.match)
     perfect = showing(to_float(batch.targets[:, 3]), augmentation)
-    assert predictor_loss(perfect, batch, augmentation, CONFIG).loss < 1e-6
+    assert predictor_loss(perfect, batch, CONFIG).loss < 1e-6
 
 
 def test_forward_genmin_prefers_later_frames_the_more_the_smaller_beta():
@@ -87,7 +89,7 @@ def test_forward_genmin_prefers_later_frames_the_more_the_smaller_beta():
     steps = []
     for method in ('genmin0.5-wo-gan', 'genmin30-wo-gan', 'min-wo-gan'):
         config = replace(CONFIG, **method_fields(method), mode='forward')
-        steps.append(predictor_loss(showing(image), batch, None, config).match.unique().tolist())
+        steps.append(predictor_loss(showing(image), batch, config).match.unique().tolist())
     assert steps == [[5], [0], [0]]
 
 
@@ -105,16 +107,16 @@ class Judge(torch.nn.Module):
 
 def test_gan_terms_stand_at_the_matched_time():
     batch = make_batch(padded=2)
-    config = replace(CONFIG, **method_fields('genmin'), gan_weight=1.0)
+    config = replace(CONFIG, **method_fields('genmin'))
     image = to_float(batch.targets[:, 2]).requires_grad_()
     networks = Networks(Showing(image), discriminator=Judge(7))
-    outcome = predictor_loss(networks, batch, None, config, Draws.make(batch, 3, 0, 0))
+    outcome = predictor_loss(networks, batch, config, Draws.make(batch, 0, 0))
     logits = image.mean((1, 2, 3))
-    expected = torch.nn.functional.softplus(-logits).mean()
+    expected = GAN_WEIGHT * torch.nn.functional.softplus(-logits).mean()
     assert outcome.parts['gan'].item() == pytest.approx(expected.item(), rel=1e-5)
-    assert outcome.judged['step'].tolist() == [2] * 4  # index of time 3
-    assert (outcome.judged['other_step'] != outcome.judged['step']).all()
-    assert (outcome.judged['other_step'] < 4).all()  # the rest is padding
+    assert outcome.judged.step.tolist() == [2] * 4  # index of time 3
+    assert (outcome.judged.other_step != outcome.judged.step).all()
+    assert (outcome.judged.other_step < 4).all()  # the rest is padding
     outcome.loss.backward()
     assert image.grad.abs().sum() > 0
     before = image.grad.clone()
@@ -152,10 +154,11 @@ def still_draws(batch, prior=0.0):
 
 def test_eq_10_l1_and_one_judge_see_the_posterior_the_other_judge_the_prior():
     batch = replace(make_batch(B=4), video=make_batch(B=4, seed=7).targets)
-    config = replace(CONFIG, **method_fields('min-vae-gan'), gan_weight=0.3, kl_weight=0.01)
+    config = replace(CONFIG, **method_fields('min-vae-gan'), kl_weight=0.01)
     networks = Networks(Shade(), Brightness(6), Judge(7), Judge(7))
-    augmentation = Augmentation.draw(4, True, True, 0.2, np.random.default_rng(0))
-    outcome = predictor_loss(networks, batch, augmentation, config, still_draws(batch, 0.5))
+    augmentation = Augmentation.draw(4, True, 0.2, np.random.default_rng(0))
+    batch = replace(batch, augmentation=augmentation)
+    outcome = predictor_loss(networks, batch, config, still_draws(batch, 0.5))
     video = augmentation.apply(to_float(batch.video))
     assert networks.recognition.seen[0].equal(video)  # changed as the context is
     mean = video.mean((1, 2, 3, 4))
@@ -167,7 +170,7 @@ def test_eq_10_l1_and_one_judge_see_the_posterior_the_other_judge_the_prior():
     softplus = torch.nn.functional.softplus
     expected = {
         'kl': 0.01 * (mean ** 2 / 2).mean(), 'error': l1_error(posterior, target).mean(),
-        'gan': 0.3 * (softplus(torch.tensor(-0.5)) + softplus(-mean).mean())}
+        'gan': GAN_WEIGHT * (softplus(torch.tensor(-0.5)) + softplus(-mean).mean())}
     assert set(outcome.parts) == set(expected)
     for name, value in expected.items():
         assert outcome.parts[name].item() == pytest.approx(value.item(), rel=1e-4), name
@@ -179,7 +182,7 @@ def test_eq_9_is_the_divergence_and_the_least_error_at_a_sample_of_the_posterior
     batch = replace(make_batch(B=4), video=make_batch(B=4, seed=7).targets)
     config = replace(CONFIG, **method_fields('min-vae'), kl_weight=0.01)
     networks = Networks(Shade(), Brightness(6))
-    outcome = predictor_loss(networks, batch, None, config, still_draws(batch))
+    outcome = predictor_loss(networks, batch, config, still_draws(batch))
     mean = to_float(batch.video).mean((1, 2, 3, 4))  # of z, which is the shade of the prediction
     errors = (mean[:, None, None, None, None] - to_float(batch.targets).movedim(-1, 2)).abs()
     least = (errors.mean((2, 3, 4)) / 2).amin(1)
@@ -187,7 +190,7 @@ def test_eq_9_is_the_divergence_and_the_least_error_at_a_sample_of_the_posterior
     assert outcome.loss.item() == pytest.approx(0.01 * nats + least.mean().item(), rel=1e-4)
     assert outcome.nats.item() == pytest.approx(nats, rel=1e-4)
     for free, price in ((nats / 4, 0.75 * nats), (2 * nats, 0.0)):
-        outcome = predictor_loss(networks, batch, None, replace(config, free_nats=free),
+        outcome = predictor_loss(networks, batch, replace(config, free_nats=free),
                                  still_draws(batch))
         assert outcome.parts['kl'].item() == pytest.approx(0.01 * price, rel=1e-4)
 
@@ -200,7 +203,7 @@ def test_appendix_b_is_the_minimum_over_the_whole_loss():
     # z says which frame it was: the l1 error is 0 at all times, and the KL divergence decides.
     divergence = 0.01 * to_float(batch.targets).mean((2, 3, 4)) ** 2 / 2
     networks = Networks(Shade(), Brightness(1))
-    outcome = predictor_loss(networks, batch, None, config, still_draws(batch))
+    outcome = predictor_loss(networks, batch, config, still_draws(batch))
     assert outcome.match.tolist() == [2, 1]
     assert outcome.loss.item() == pytest.approx(divergence.amin(1).mean().item(), abs=1e-6)
     assert all(seen.shape[1] == 3 for seen in networks.recognition.seen)  # context and one frame
@@ -224,14 +227,14 @@ def test_recursion_goes_on_from_its_own_prediction_and_leaves_that_alone(mode, s
     config = replace(CONFIG, **method_fields('min-wo-gan'), mode=mode, recursion=2)
     frames = to_float(batch.targets)
     network = Moving(frames[:, 2].clone().requires_grad_(), frames[:, second])
-    assert predictor_loss(Networks(network), batch, None, config).loss < 1e-6
+    assert predictor_loss(Networks(network), batch, config).loss < 1e-6
     assert not network.contexts[1].requires_grad
     assert network.contexts[1][:, -1].equal(frames[:, 2])
     if mode == 'bidirectional':
         assert network.contexts[1][:, 0].equal(to_float(batch.context[:, 0]))
     # A frame on the other side is no target of the second level.
     wrong = Moving(frames[:, 2], frames[:, 4 - second])
-    assert predictor_loss(Networks(wrong), batch, None, config).loss > 0.1
+    assert predictor_loss(Networks(wrong), batch, config).loss > 0.1
 
 
 def test_progress_prefers_half_way_in_the_pictures_and_leaves_out_what_shows_an_input():
@@ -242,7 +245,7 @@ def test_progress_prefers_half_way_in_the_pictures_and_leaves_out_what_shows_an_
         batch = Batch(torch.stack([start, goal])[None].byte(), targets[None].byte(),
                       torch.arange(1, T + 1)[None], column, column * T, column * (T + 1),
                       torch.ones(1, T, dtype=torch.bool))
-        return predictor_loss(showing(image(frames)[None]), batch, None, replace(
+        return predictor_loss(showing(image(frames)[None]), batch, replace(
             CONFIG, **settings)).match.item()
 
     late = (0.02, 0.04, 0.06, 0.08, 0.1, 0.5, 0.9)  # of targets that fit alike the one half way

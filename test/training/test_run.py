@@ -15,7 +15,7 @@ from tap_ros.errors import ConfigError, StorageError, WeightsError
 from tap_ros.files import only_writer
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
-from tap_ros.training.checkpoints import start, TrainingState
+from tap_ros.training.checkpoints import start, TrainingState, WARMUP
 from tap_ros.training.weights import load_tensors, save_tensors
 import torch
 
@@ -114,12 +114,17 @@ def test_a_run_of_other_settings_or_of_another_process_is_not_continued(half):
         train(replace(half, learning_rate=0.1), progress=False)
     with only_writer(half.out), pytest.raises(StorageError, match='another process'):
         train(half, progress=False)
+    path = Path(half.out, 'checkpoint.safetensors')
+    tensors, about = load_tensors(path)
+    save_tensors(path, tensors, {**about, 'settings': {**about['settings'], 'flip': True}})
+    with pytest.raises(ConfigError, match='made by another version of tap_ros'):
+        train(half, progress=False)
 
 
 def test_patience_keeps_the_best_weights_and_ends_when_none_better_come(tmp_path, monkeypatch):
     scores = {1: 3.0, 2: 1.0, 3: 2.0, 4: 2.0, 5: 0.5}
-    monkeypatch.setattr('tap_ros.prediction.training._score', lambda gather, this, state, *_: (
-        {'relative': scores.get(state.step, 1.0)}, {}))
+    monkeypatch.setattr('tap_ros.prediction.training._score', lambda run, *_: (
+        {'relative': scores.get(run.state.step, 1.0)}, {}))
     patient = replace(CONFIG, patience=2, steps=9, save_every=1)
     held = {}
     for name, stops in (('whole', (9,)), ('parts', (1, 2, 3, 9, 9))):
@@ -146,17 +151,16 @@ def load_average(config):
 
 
 def test_learning_rate_rises_and_falls_and_the_average_moves_fast_at_first():
-    state, rates = start(torch.nn.Linear(3, 2), 1.0, 'cpu'), []
-    for state.step in range(1000):
-        state.set_rates(1000, 10)
+    state, rates = start(torch.nn.Linear(3, 2), 1.0, 'cpu', 0.9), []
+    for state.step in range(10000):
+        state.set_rates(10000)
         rates.append(state.optimizers[0].param_groups[0]['lr'])
     assert rates[0] < 0.1 and max(rates) == pytest.approx(1, abs=0.01)
     assert rates[-1] == pytest.approx(0.02, abs=0.001)
-    assert all(a >= b for a, b in zip(rates[10:], rates[11:]))
-    for state.step, decay, stays in ((0, 0.999, 0.1), (8, 0.999, 0.5), (10**6, 0.9, 0.9),
-                                     (0, 0.0, 0.0)):
+    assert all(a >= b for a, b in zip(rates[WARMUP:], rates[WARMUP + 1:]))
+    for state.step, stays in ((0, 0.1), (8, 0.5), (10**6, 0.9)):
         before = state.average.weight.clone()
         with torch.no_grad():
             state.network.weight.copy_(before + 1)
-        state.update_average(decay)
+        state.update_average()
         assert torch.allclose(state.average.weight, before + (1 - stays), atol=1e-6)

@@ -80,7 +80,8 @@ def test_recordings_that_are_named_are_held_out_wherever_they_are(tmp_path, monk
     monkeypatch.chdir(tmp_path)
 
     def split(recordings, *held_out):
-        paths = paths_of(ForwardTrainingConfig(tuple(recordings), 'x', held_out=held_out))
+        paths = paths_of(ForwardTrainingConfig(
+            recordings=tuple(recordings), held_out=held_out))
         store = open_recordings(paths, tmp_path / 'cache', progress=False)
         return [[store[i].seed for i in part]
                 for part in split_episodes(store, 0.3, held_out=held_out)]

@@ -32,21 +32,18 @@ def path(tmp_path):
     return path
 
 
-def test_weights_round_trip_also_those_of_earlier_versions(path):
+def test_weights_round_trip_and_fit_their_configuration(path):
     network = PredictorNetwork(CONFIG)
     save_weights(path, network, 'predictor', CONFIG, {'seed': 3, 'scores': {'min_l1': 0.5}})
     values, state, training = load_weights(path, 'predictor')
     assert training == {'seed': 3, 'scores': {'min_l1': 0.5}}
-    # Files of earlier versions lack what came later; all the others are needed.
-    old = {name: value for name, value in values.items() if name not in ('decoder', 'skips')}
-    for config in (values, old):
-        other = make_network(PredictorNetwork, PredictorConfig, config, state, path)
-        assert other.config == CONFIG
-        assert all(other.state_dict()[name].equal(tensor)
-                   for name, tensor in network.state_dict().items())
+    other = make_network(PredictorNetwork, PredictorConfig, values, state, path)
+    assert other.config == CONFIG
+    assert all(other.state_dict()[name].equal(tensor)
+               for name, tensor in network.state_dict().items())
     for config, said in (
             (values | {'base_width': 8}, 'size mismatch for encoder.0.weight'),
-            ({k: v for k, v in old.items() if k != 'code_size'}, 'configuration code_size'),
+            ({k: v for k, v in values.items() if k != 'code_size'}, 'configuration code_size'),
             (values | {'wings\n': 2}, 'unknown configuration wings')):
         with pytest.raises(WeightsError, match=said):
             make_network(PredictorNetwork, PredictorConfig, config, state, path)

@@ -468,8 +468,8 @@ def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare('tracker', 'rigid', 'What follows the objects: their shapes on the table '
-                       '(rigid), the forward model that plans (carried), or a tracker of another '
-                       'package.', choices=names('tap_ros.trackers'))
+                       '(rigid), or a tracker of another package.',
+                       choices=names('tap_ros.trackers'))
     parameters.declare_shared('image_transport', 'joint_prefix', robot_mask='all')
     parameters.declare_camera(f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
     parameters.declare_arm()
