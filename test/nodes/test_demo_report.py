@@ -7,14 +7,20 @@ import io
 import json
 from pathlib import Path
 import re
+import threading
 
+from builtin_interfaces.msg import Time
 from mcap.reader import make_reader
 import numpy as np
 from PIL import Image, ImageSequence
-from processes import crowd
+from processes import Client, crowd, until
 import pytest
+from rclpy.duration import Duration
+from std_msgs.msg import Header
+from tap_msgs.msg import ObjectStates
 from tap_ros.errors import TapError
 from tap_ros.messages.subgoals import Subgoal
+from tap_ros.nodes import client
 from tap_ros.nodes.demo import command
 from tap_ros.nodes.demo.film import (
     film,
@@ -30,6 +36,8 @@ from tap_ros.nodes.demo.film import (
 )
 from tap_ros.nodes.demo.lane import Lane
 from tap_ros.nodes.demo.report import gains, results_table, shown, summary, write_report
+from tap_ros.nodes.demo.watch import Watch
+from tap_ros.nodes.topics import STREAM
 from tap_ros.recording.cache import open_recordings
 
 LAYOUT = Path(__file__).parents[2] / 'config' / 'layouts' / 'tap_ros.json'
@@ -147,6 +155,21 @@ def test_what_was_done_is_kept_what_cannot_be_is_counted_and_logs_are_read(
     monkeypatch.setattr(command, 'run_scenes', lambda *_: iter([TapError('a reason')]))
     with pytest.raises(TapError, match='no scene could be finished; a reason'):
         command.run(options)
+
+
+@pytest.mark.ros
+def test_no_moment_is_lost_while_the_demo_is_held_up():
+    with client.Client('/held_up') as held_up, Client('world', namespace='/held_up') as world:
+        watch = Watch(held_up, False, 'camera/image_raw')
+        go_on = threading.Event()
+        moments = world.create_publisher(ObjectStates, 'objects', STREAM)
+        assert until(lambda: moments.get_subscription_count())
+        held_up.node.executor.create_task(go_on.wait)
+        for sec in range(40):
+            moments.publish(ObjectStates(header=Header(stamp=Time(sec=sec))))
+            until(lambda: moments.wait_for_all_acked(Duration(seconds=1)))
+        go_on.set()
+        assert len(watch.since(0, 40, 'objects')) == 40
 
 
 @pytest.mark.slow

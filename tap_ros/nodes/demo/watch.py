@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 import numpy as np
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_ros.errors import TapError
@@ -17,10 +18,12 @@ from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import Client, positions_of, View
-from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.nodes.topics import LATCHED
 from tap_ros.tracking.protocols import LOST
 from tap_ros.training.robot_mask import nearest_free
 
+# Nothing is lost while this process, which also draws films, is held up.
+STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 CLICKS, SLIP = 5, 0.015  # tries to click; how far beside the first the others are, of a picture
 
 
