@@ -36,7 +36,7 @@ from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.calls import call, CallError, Spinner
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.reaching import CANCEL, Goals, Reaching
+from tap_ros.nodes.reaching import CANCEL, CLIENT, Goals, Reaching
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.run import configure_fast_dds
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
@@ -109,7 +109,7 @@ class Client:
             rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             try:
                 # A name of its own, by which the planner can tell who has sent a goal.
-                node = Node(f'tap_ros_client_{secrets.token_hex(4)}', namespace=namespace,
+                node = Node(f'{CLIENT}{secrets.token_hex(4)}', namespace=namespace,
                             context=self._context)
             except (InvalidNamespaceException, TypeError, UnicodeError) as error:
                 self._context.try_shutdown()
