@@ -36,7 +36,7 @@ from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.calls import call, CallError, Spinner
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.reaching import CANCEL, Goals, Reaching
+from tap_ros.nodes.reaching import CANCEL, CLIENT, Goals, Reaching
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.run import configure_fast_dds
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
@@ -109,7 +109,7 @@ class Client:
             rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             try:
                 # A name of its own, by which the planner can tell who has sent a goal.
-                node = Node(f'tap_ros_client_{secrets.token_hex(4)}', namespace=namespace,
+                node = Node(f'{CLIENT}{secrets.token_hex(4)}', namespace=namespace,
                             context=self._context)
             except (InvalidNamespaceException, TypeError, UnicodeError) as error:
                 self._context.try_shutdown()
@@ -235,7 +235,7 @@ class Client:
         :return: Reaching, once the goal is accepted; it ends with this client at the latest.
         :raises CallError: when the planner does not answer, or rejects it: it has another goal.
         """
-        pixels = goal_pixels or {}
+        pixels = _places(goal_pixels or {})
         request = _message(ReachGoal.Goal, request_fields(
             tuple(pixels), goal_image=goal, goal_objects=list(pixels.values()) or None) | {
                 'mode': mode, 'step_budget': step_budget, 'recursion_depth': recursion_depth,
@@ -293,12 +293,13 @@ class Client:
         :param stamp_ns: of the picture that was clicked: none that is older is used.
         :raises CallError: with the reason, such as a click on the robot; then nothing changes.
         """
-        u, v = _pixels(list(pixels.values()), 'pixels').T.tolist()
+        u, v = _pixels(list(_places(pixels).values()), 'pixels').T.tolist()
         self.call('select', names=_names(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""
-        self.call('set_goal', **request_fields(tuple(pixels), objects=list(pixels.values())))
+        self.call('set_goal', **request_fields(
+            tuple(_places(pixels)), objects=list(pixels.values())))
 
     def pause(self, paused: bool = True) -> None:
         """Pause the simulator, or let it go on."""
@@ -420,7 +421,7 @@ def subgoals_of(response: PredictSubgoal.Response) -> 'list[Subgoal]':
 def _message(kind: Callable[..., Any], fields: Mapping[str, Any]) -> Any:
     """Return a message; raise ConfigError for what one of its fields cannot hold."""
     for name, value in fields.items():
-        for text in value if isinstance(value, list) else [value]:
+        for text in value if isinstance(value, (list, tuple, set)) else [value]:
             if isinstance(text, str) and not _is_text(text):
                 raise ConfigError(f'{name}: expected a text, got {escaped(repr(text), 60)}')
     try:
@@ -456,6 +457,14 @@ def _names(names: Iterable[Any]) -> list[str]:
             raise ConfigError(
                 f'the name of an object: expected a text, got {escaped(repr(name), 60)}')
     return names
+
+
+def _places(pixels: Any) -> Mapping[str, Any]:
+    """Return pixels by name; raise ConfigError for what is no mapping."""
+    if not isinstance(pixels, Mapping):
+        raise ConfigError('expected pixels by the names of objects, {name: (u, v)}, got '
+                          f'{escaped(repr(pixels), 60)}')
+    return pixels
 
 
 def _is_text(value: Any) -> bool:

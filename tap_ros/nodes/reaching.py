@@ -19,12 +19,16 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from tap_msgs.action import ReachGoal
+from tap_ros.contract import NODE_CLASSES
 from tap_ros.nodes.calls import call, CallError, POLL_S, wait_for_answer
 from tap_ros.nodes.heartbeat import Liveness, Presence, publishers_present
+from tap_ros.nodes.services import log_error
+from tap_ros.nodes.subscriptions import UNKNOWN
 
 ACTION = 'reach_goal'
 STATUS, FEEDBACK = f'{ACTION}/_action/status', f'{ACTION}/_action/feedback'
 CANCEL = f'{ACTION}/_action/cancel_goal'
+CLIENT = 'tap_ros_client_'  # begins the name of a Client's own node
 SENDER_BYTES = 12  # of a goal's id: of its sender's process
 CANCEL_S = 1.0  # until a cancel that is not answered is sent again
 CLOSE_S = 5.0  # that cancelling may take when a client ends: more than a dead planner's lease
@@ -145,8 +149,8 @@ class Reaching:
     :param goal: the action's goal.
     :param timeout_s: most seconds until the end; whoever waits for longer cancels the goal.
     :param accept_s: most seconds until it is accepted.
-    :param on_feedback: called with each feedback by another thread; without it they are kept for
-        the iteration.
+    :param on_feedback: called with each feedback by another thread; where it raises, the goal is
+        cancelled. Without it they are kept for the iteration.
     :raises CallError: when no planner answers in time, or it rejects the goal.
     """
 
@@ -254,12 +258,18 @@ class Reaching:
             time.sleep(POLL_S)
         self._presence = publishers_present(self._goals.node, STATUS)
 
+        def take(message: Any) -> None:
+            try:
+                self._take(message.feedback)
+            except Exception as error:  # it would end the thread that spins the node
+                log_error(self._goals.node, f'{self._name}: on_feedback', error)
+                self.cancel()
+
         def send() -> Future:
             with self._lock:
                 if self._given_up:
                     raise CallError(f'{self._name}: given up')
-                self._accepted = self._goals.action.send_goal_async(
-                    goal, lambda message: self._take(message.feedback), self._id)
+                self._accepted = self._goals.action.send_goal_async(goal, take, self._id)
                 return self._accepted
 
         accepted = self._in_executor(send, deadline)
@@ -312,15 +322,20 @@ def watch_sender(node: Node, goal_id: bytes) -> Callable[[], bool]:
 
     A Client of this package is known by the id. Of other programs it is known that they listen to
     the feedback of their goals: none may be left of those that did when the goal was accepted.
+    Our own programs listen, too, but have not sent a goal whose id names none of them.
 
     :param node: that serves the goal; goal_id: its 16 bytes.
     """
     def there() -> set[bytes]:
         return {one for one, *_ in _listeners(node)}
 
+    def strangers() -> set[bytes]:
+        return {one for one, name, _ in _listeners(node)
+                if name not in {UNKNOWN, *NODE_CLASSES} and not name.startswith(CLIENT)}
+
     sender = Presence(lambda: there() & {goal_id[:SENDER_BYTES]})
-    listeners = Presence(there)
-    return lambda: sender.gone or (not sender.there and listeners.gone)
+    others, listeners = Presence(strangers), Presence(there)
+    return lambda: sender.gone or (not sender.there and (others.gone or listeners.gone))
 
 
 def _listeners(node: Node) -> list[tuple[bytes, str, str]]:

@@ -7,6 +7,7 @@ from functools import partial
 import json
 import re
 import shutil
+import signal
 import time
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
@@ -202,8 +203,14 @@ def test_a_goal_of_another_client_is_seen_and_can_be_cancelled(explored):
         assert not told()['run']['running']
         reaching = explored.loop.begin(mode='direct', step_budget=1000)
         assert 'another client' in told(lambda now: now['run']['running'])['run']['stage']
-        ask({'do': 'cancel'})
-        assert reaching.result().end == 'cancelled'
+        predictor = explored.loop.processes['predictor_node']
+        predictor.send(signal.SIGSTOP)
+        try:
+            count = told()['log_count']
+            ask(*5 * [{'do': 'predict'}], {'do': 'cancel'})  # at once, whatever is waited for
+            assert reaching.result().end == 'cancelled' and told()['log_count'] <= count + 1
+        finally:
+            predictor.send(signal.SIGCONT)
         told(lambda now: not now['run']['running'])
 
 

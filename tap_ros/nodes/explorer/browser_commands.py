@@ -102,6 +102,7 @@ class ExplorerCalls:
         node.create_subscription(GoalStatusArray, STATUS, self._on_status,
                                  qos_profile_action_status_default)
         self._pool = ThreadPoolExecutor(4, 'explorer')
+        self._cancelling = ThreadPoolExecutor(1, 'cancel')  # not behind what waits for its answer
 
     def offered(self, service: str) -> bool:
         """Return whether a node offers a service, such as 'reset', 'set_goal' and 'select'."""
@@ -140,17 +141,19 @@ class ExplorerCalls:
                 if self.running:
                     raise CommandError('a goal is in progress; cancel it or wait for its end')
                 self._asked, self._cancelled = True, False
-        self._pool.submit(self._carry_out, do, fields)
+        pool = self._cancelling if do == 'cancel' else self._pool
+        pool.submit(self._carry_out, do, fields)
 
     def close(self) -> None:
         """Cancel the goal that a browser began, and end; in the thread that spins the node."""
         self._ending = self._cancelled = True
-        closing, executor = self._pool.submit(self._client.close), self._node.executor
+        closing, executor = self._cancelling.submit(self._client.close), self._node.executor
         deadline = time.monotonic() + END_S
         while executor is not None and time.monotonic() < deadline and (
                 self._asked or not closing.done()):
             executor.spin_once(timeout_sec=0.05)  # nobody else does any more
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        for pool in (self._pool, self._cancelling):
+            pool.shutdown(wait=False, cancel_futures=True)
 
     def _on_status(self, message: GoalStatusArray) -> None:
         self._under_way = any(one.status in UNDER_WAY for one in message.status_list)

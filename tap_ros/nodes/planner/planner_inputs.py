@@ -70,7 +70,7 @@ class PlannerInputs:
                                others={'joints': self._on_joints})
         node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
         self._told_lock_step = False
-        self._simulator = node.create_subscription(Bool, LOCK_STEP, self._on_lock_step, LATCHED)
+        node.create_subscription(Bool, LOCK_STEP, self._on_lock_step, LATCHED)
 
     def begin(self, since: float) -> None:
         """Begin a goal: only what is received from this monotonic time on is seen."""
@@ -114,8 +114,12 @@ class PlannerInputs:
 
     @property
     def _lock_step(self) -> bool:
-        """Tell whether the simulator waits for commands, so that what is seen does not age."""
-        return self._told_lock_step and self._simulator.get_publisher_count() > 0
+        """Tell whether what moves the arm waits for commands, so that nothing ages."""
+        if not self._told_lock_step:
+            return False
+        tellers, arms = publishers_of(
+            self._node, [LOCK_STEP, self._types['joints'][1]]).values()
+        return bool(tellers) and tellers.keys() <= arms.keys()
 
     def newest_stamp(self) -> int:
         """Return the stamp of the newest picture that has come with its joints, in ns."""
