@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 from geometry_msgs.msg import TwistStamped
 from lively import lively_network
@@ -200,6 +201,14 @@ def test_when_the_predictor_hangs_or_dies_the_arm_stays_and_the_planner_lives(lo
     served(loop)
     predictor.start().wait_for('ready', 120)  # soon: Fast DDS has not given up the one before
     loop.wait_until_seen()
+
+
+def test_a_planner_that_stood_still_goes_on_where_time_waits_for_it(loop):
+    reaching = loop.begin_moving(step_budget=4)
+    loop.processes['visual_mpc_node'].send(signal.SIGSTOP)
+    time.sleep(2.3)  # less than the lease of a process
+    loop.processes['visual_mpc_node'].send(signal.SIGCONT)
+    assert reaching.result().end == 'succeeded' and reaching.result().steps == 4
 
 
 @pytest.mark.parametrize('stands_s', [1.5, 5.0])

@@ -73,7 +73,7 @@ class ArmCommander:
             self._stop()
 
     def send(self, goal: object, action: np.ndarray, stamp: Time,
-             topics: Collection[str]) -> bool:
+             topics: Collection[str], ages: bool = True) -> bool:
         """
         Send one command, clipped to the limits.
 
@@ -81,6 +81,7 @@ class ArmCommander:
         :param action: (4,) metres moved in one control period, and gripper opening 0..1.
         :param stamp: builtin_interfaces/Time of the image that it answers.
         :param topics: sensors that the arm depends on until the next command.
+        :param ages: whether what they tell gets old; not where time waits for commands.
         :return: whether it was sent; not when the goal has ended or a sensor is silent.
         :raises PlanningError: for numbers that are not finite, and after this process stood still:
             messages received then may be old.
@@ -100,7 +101,7 @@ class ArmCommander:
         with self._lock:
             now = time.monotonic()
             self._tick()
-            if self._stood_s:
+            if self._stood_s and ages:
                 raise PlanningError(f'the planner stood still for {self._stood_s:.1f} s; what it '
                                     'sees may be old. Send the goal again')
             if self._closed or self._goal is not goal or self._silent(topics, now):

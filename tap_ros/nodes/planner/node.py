@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+import math
 from pathlib import Path
 import threading
 import time
@@ -332,7 +333,8 @@ class VisualMpcNode(LifecycleBase):
         if self._goal.changed(accepted):
             return False
         return self._arm.send(
-            handle, command.plan.action, to_stamp(command.seen.stamp_ns), self._inputs.topics)
+            handle, command.plan.action, to_stamp(command.seen.stamp_ns), self._inputs.topics,
+            ages=command.seen.received < math.inf)
 
     def _tell(self, handle: ServerGoalHandle, reach: Reach, command: Command) -> None:
         """Publish feedback, the plan and the distance after a command."""
