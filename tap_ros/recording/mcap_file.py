@@ -79,7 +79,7 @@ class McapFile:
             raise RecordingError(f'{path}: {why}')
         self.channels: dict[int, Channel] = {}
         self.losses: list[Loss] = []
-        self._schemas: dict[int, Schema] = {}
+        self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, text
         self._newest: int | None = None  # log time so far
         self._counts: Counter[int] = Counter()  # messages read by channel
         self._is_read = False  # to the end
@@ -124,9 +124,12 @@ class McapFile:
                 continue
             if data[:4] == zstandard.FRAME_HEADER:  # rosbag2 compressed it
                 with suppress(*_DAMAGE):  # who decodes it says that it is none
-                    content = _unpack('zstd', data, _MAX_MESSAGE_BYTES + 1)
-                    self._budget.take(len(content))
-                    if len(content) <= _MAX_MESSAGE_BYTES:
+                    told = zstandard.frame_content_size(data)
+                    most = _MAX_MESSAGE_BYTES if told < 0 else min(told, _MAX_MESSAGE_BYTES)
+                    self._budget.take(most)  # before it costs time
+                    content = _unpack('zstd', data, most + 1)
+                    self._budget.take(len(content) - most)
+                    if len(content) <= most:
                         data = memoryview(content)
             yield channel, min(log, FAR), min(publish, FAR), data
         self._conclude(wanted)
@@ -206,6 +209,7 @@ class McapFile:
         try:
             if isinstance(chunk, ChunkIndex):  # the header of its record is not believed
                 index, end = chunk, start + chunk.chunk_length
+                self._budget.take(min(chunk.chunk_length, len(self._data)))
                 content = self._data[start + _RECORD.size:end]
                 chunk = Chunk.read(ReadDataStream(BytesIO(content)))
                 if chunk.uncompressed_size != index.uncompressed_size:
@@ -235,12 +239,13 @@ class McapFile:
                 found.append((record.channel_id, record.log_time, record.publish_time,
                               memoryview(record.data)))
             elif isinstance(record, Schema):
-                self._schemas.setdefault(record.id, record)
+                self._schemas.setdefault(record.id, (  # once, as channels may share it
+                    record.name, record.encoding,
+                    record.data[:_MAX_SCHEMA_BYTES].decode(errors='replace')))
             elif isinstance(record, ChannelRecord) and record.id not in self.channels:
-                schema = self._schemas.get(record.schema_id, Schema(0, b'', '', ''))
+                name, encoding, text = self._schemas.get(record.schema_id, ('', '', ''))
                 self.channels[record.id] = Channel(
-                    record.topic, schema.name, record.message_encoding, schema.encoding,
-                    schema.data[:_MAX_SCHEMA_BYTES].decode(errors='replace'))
+                    record.topic, name, record.message_encoding, encoding, text)
         self._counts.update(number for number, *_ in found)
         times = [min(log, FAR) for _, log, *_ in found]
         if times:

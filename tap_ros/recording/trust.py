@@ -80,8 +80,8 @@ def inside(folder: str | Path, name: str | Path) -> Path:
         path = (root / name).resolve()
     except (OSError, RuntimeError, ValueError) as error:
         raise RecordingError(f'{escaped(name)}: is no name of a file: {escaped(error)}') from error
-    if root.parent.name == 'snapshots' and (root.parents[1] / 'blobs').is_dir():
-        root = root.parents[1]
+    root = next((above.parent for above in root.parents if above.name == 'snapshots'
+                 and (above.parent / 'blobs').is_dir()), root)
     if not path.is_relative_to(root):
         raise RecordingError(f'{escaped(name)} leads out of {escaped(folder)}; what is meant has '
                              'to be in there, or given by its own path')

@@ -454,3 +454,18 @@ def test_marks_that_are_none_are_told_in_a_line(content, tmp_path):
     os.mkfifo(file) if content is None else file.write_text(content)
     with pytest.raises(ConfigError, match='a.marks.json'):
         read_marks(file, store)
+
+
+@pytest.mark.parametrize('values', [
+    pyarrow.ListArray.from_arrays(pyarrow.array([0, 10**8], pyarrow.int32()),
+                                  pyarrow.nulls(10**8, pyarrow.int8())),
+    pyarrow.DictionaryArray.from_arrays(np.zeros(1, np.int32), [bytes(2**20)])])
+def test_a_row_of_more_than_numbers_and_names_is_not_unpacked(values, tmp_path, run):
+    folder = lerobot(tmp_path / 'set')
+    parquet.write_table(pyarrow.table({
+        'timestamp': values, 'index': [3], 'episode_index': [1],
+        CAMERA: [{'bytes': png(), 'path': None}]}), folder / 'data/001.parquet')
+    (folder / 'meta/episodes.jsonl').write_text('\n'.join(json.dumps({
+        'episode_index': e, 'length': length}) for e, length in enumerate((3, 1))))
+    frames, said = run('import-lerobot', folder)
+    assert len(frames) == 1 and 'more than numbers' in said

@@ -42,6 +42,7 @@ from tap_ros.recording.trust import Budget, MOST_BYTES, MOST_FRAMES
 from tap_ros.text import escaped, listing
 
 FPS = 10.0  # where nobody says another
+_KEPT = 2**20  # bytes of chunks that HDF5 keeps unpacked
 
 
 def run(args: Options) -> None:
@@ -115,21 +116,30 @@ def _arrays(root: Any, lacking: Lacking,
                 one = group[name]
                 if isinstance(one, h5py.Group):
                     groups.append((f'{path}/', one))
-                elif isinstance(one, h5py.Dataset) and _holds_pictures(one):
+                elif isinstance(one, h5py.Dataset) and _holds_pictures(one, budget):
                     yield path, partial(_read, one, budget)
 
 
 def _read(array: Any, budget: Budget) -> Iterable[Any]:
     """Return the rows of an array; of an array of any length one after the other."""
     if array.dtype.kind == 'O':
-        return (array[row] for row in range(len(array)))
+        return (_row(array, row, budget) for row in range(len(array)))
     if array.nbytes > MOST_BYTES:
         raise RecordingError(f'it has more than {MOST_BYTES >> 30} GiB')
     budget.take(array.nbytes)
     return array[:]
 
 
-def _holds_pictures(array: Any) -> bool:
+def _row(array: Any, row: int, budget: Budget) -> Any:
+    """Return a row; what is unpacked for it counts, as rows may share all that a file holds."""
+    chunk = math.prod(array.chunks or ()) * max(array.dtype.itemsize, 16)  # of a reference
+    budget.take(chunk if chunk > _KEPT else 0)
+    values = array[row]
+    budget.take(getattr(values, 'nbytes', 0) or len(values))
+    return values
+
+
+def _holds_pictures(array: Any, budget: Budget) -> bool:
     """
     Tell whether an array is of pictures.
 
@@ -152,7 +162,7 @@ def _holds_pictures(array: Any) -> bool:
         raise RecordingError(f'its pictures have {row_bytes} bytes')
     if not is_files:
         return True
-    first = array[0]
+    first = _row(array, 0, budget)
     is_file = isinstance(first, bytes | np.void) or getattr(first, 'dtype', None) == np.uint8
     return is_file and bytes(first).startswith((b'\xff\xd8\xff', b'\x89PNG'))
 

@@ -185,7 +185,7 @@ class DataSet:
                 table = self._read_parquet(file.relative_to(self.folder))
                 for part in table.select([name for name in table.column_names if name.startswith(
                         (*_OF_EPISODES, 'data/', 'videos/'))]).to_batches():
-                    found += map(_cut_short, part.to_pylist())
+                    found += map(_cut_short, _listed(part))
         if not found and (self.folder / _LINES).exists():
             with self.lacking.passing_over('file', _LINES):
                 found = read_bytes(inside(self.folder, _LINES), _MOST_BYTES).splitlines()
@@ -234,7 +234,7 @@ class DataSet:
         table, T = self._file[1], row['length']
         first = table['index'][0].as_py()
         part = table.slice(row.get('dataset_from_index', first) - first, T)
-        if len(part) != T or set(part['episode_index'].to_pylist()) != {row['episode_index']}:
+        if len(part) != T or set(_listed(part['episode_index'])) != {row['episode_index']}:
             raise ValueError('its rows are not where meta/episodes says')
         return part
 
@@ -277,7 +277,7 @@ class DataSet:
         T = len(kept)
 
         def numbers(key: str, width: int) -> np.ndarray:
-            return np.array(part[key].to_pylist(), np.float32).reshape(-1, width)[kept]
+            return np.array(_listed(part[key]), np.float32).reshape(-1, width)[kept]
 
         known: dict[str, Any] = {}
         if self._objects:
@@ -290,9 +290,9 @@ class DataSet:
         outcome, seconds = row.get(OUTCOME, ''), np.arange(len(part)) / self.fps
         self.marks.append([])
         if SUBTASK in self.features:
-            ends = np.flatnonzero(np.diff(np.ravel(part[SUBTASK].to_pylist())[kept]))
+            ends = np.flatnonzero(np.diff(np.ravel(_listed(part[SUBTASK]))[kept]))
             self.marks[-1] = ends[ends > 0].tolist()
-        told = np.array(part['timestamp'], float).ravel()
+        told = np.array(_listed(part['timestamp']), float).ravel()
         if (np.abs(told - told[0] - seconds) > 0.5 / self.fps).any() and (np.diff(told) > 0).all():
             seconds = told  # another rate than that of the description
         return make_episode(
@@ -328,14 +328,15 @@ class DataSet:
                 part: Any) -> tuple[list[float], Callable[[float], np.ndarray]]:
         """Return the time of each row in a video, and what returns the frame of a time."""
         path = self._path(self._video_path, row, f'videos/{self.camera}')
-        times = self._starts[row['episode_index']] + np.array(part['timestamp'], float).ravel()
+        times = self._starts[row['episode_index']] + np.array(
+            _listed(part['timestamp']), float).ravel()
         if self._video is None or self._video.path != path or self._video.now[0] > times[0]:
             self._video = _Video(path, video_frames(inside(self.folder, path)))
         video = self._video
 
         def show(at: float) -> np.ndarray:
             seen, picture = video.at(at)
-            if abs(seen - at) > 1 / self.fps:
+            if not abs(seen - at) <= 1 / self.fps:  # nor for NaN
                 raise RecordingError(f'{escaped(path)} has no frame at {at:.3f} s')
             return picture
         return times.tolist(), show
@@ -367,6 +368,18 @@ class _Video:
 def object_columns(names: tuple[str, ...]) -> list[str]:
     """Return the names of the numbers in OBJECTS: u and v of each object."""
     return [f'{name}_{axis}' for name in names for axis in 'uv']
+
+
+def _listed(values: Any) -> list[Any]:
+    """
+    Return what a table holds as Python's values, which take far more memory.
+
+    :raises ValueError: for more than descriptions and numbers have.
+    """
+    if values.nbytes > _MOST_BYTES or 'dictionary' in str(
+            getattr(values, 'schema', None) or values.type):  # whose values repeat
+        raise ValueError('its columns hold more than numbers and names')
+    return list(values.to_pylist())
 
 
 def _is_depth(feature: dict[str, Any]) -> bool:
