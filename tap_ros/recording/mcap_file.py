@@ -139,8 +139,9 @@ class McapFile:
         """Yield the messages of the file, block by block."""
         if self._summary.chunk_indexes and self.channels:
             entries = {entry.chunk_start_offset: entry for entry in self._summary.chunk_indexes}
-            for start, entry in sorted(entries.items()):
-                yield self._unpacked(start, entry)
+            starts = sorted(entries)
+            for start, behind in zip(starts, [*starts[1:], len(self._data)]):
+                yield self._unpacked(start, entries[start], behind)
             return
         for start, record in self._in_order():
             yield self._unpacked(start, record) if isinstance(record, Chunk) else (
@@ -202,14 +203,17 @@ class McapFile:
             yield from _split(
                 _unpack(name, self._data[start + stream.count:], size), self._budget)
 
-    def _unpacked(self, start: int, chunk: Chunk | ChunkIndex) -> list[Found]:
-        """Return the messages of a chunk, or of what the summary says of one, at a byte."""
+    def _unpacked(self, start: int, chunk: Chunk | ChunkIndex, behind: int = 0) -> list[Found]:
+        """
+        Return the messages of a chunk, or of what the summary says of one, at a byte.
+
+        :param behind: where the summary says that the next one begins.
+        """
         first, last = (min(time, FAR) for time in (
             chunk.message_start_time, chunk.message_end_time))
         try:
             if isinstance(chunk, ChunkIndex):  # the header of its record is not believed
-                index, end = chunk, start + chunk.chunk_length
-                self._budget.take(min(chunk.chunk_length, len(self._data)))
+                index, end = chunk, min(start + chunk.chunk_length, behind)
                 content = self._data[start + _RECORD.size:end]
                 chunk = Chunk.read(ReadDataStream(BytesIO(content)))
                 if chunk.uncompressed_size != index.uncompressed_size:

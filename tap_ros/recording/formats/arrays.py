@@ -43,6 +43,7 @@ from tap_ros.text import escaped, listing
 
 FPS = 10.0  # where nobody says another
 _KEPT = 2**20  # bytes of chunks that HDF5 keeps unpacked
+_SHARED = 50  # that bytes of rows of any length count: they are not compressed, but may be shared
 
 
 def run(args: Options) -> None:
@@ -135,7 +136,7 @@ def _row(array: Any, row: int, budget: Budget) -> Any:
     chunk = math.prod(array.chunks or ()) * max(array.dtype.itemsize, 16)  # of a reference
     budget.take(chunk if chunk > _KEPT else 0)
     values = array[row]
-    budget.take(getattr(values, 'nbytes', 0) or len(values))
+    budget.take(_SHARED * (getattr(values, 'nbytes', 0) or len(values)))
     return values
 
 
