@@ -4,18 +4,19 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 import threading
 import time
 from typing import Any, Self
 
 from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 from tap_ros.errors import TapError
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.services import wait_for_some
+from tap_ros.nodes.services import log_error, wait_for_some
 from tap_ros.nodes.subscriptions import PollOnlyGroup
 
 POLL_S = 0.05  # between two looks at whether a server is still there
@@ -41,8 +42,10 @@ class Spinner:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._stop = threading.Event()
-        self._threads = [threading.Thread(target=target, name=name, daemon=True) for target, name
-                         in ((self._spin, 'spinner'), (self._take_answers, 'answers'))]
+        spin = partial(self._executor.spin_once, timeout_sec=0.1)
+        self._threads = [
+            threading.Thread(target=self._repeat, args=(do,), name=name, daemon=True)
+            for do, name in ((spin, 'spinner'), (self._take_answers, 'answers'))]
 
     def __enter__(self) -> Self:
         for thread in self._threads:
@@ -55,23 +58,27 @@ class Spinner:
             thread.join(timeout=5.0)
         self._executor.shutdown(timeout_sec=1.0)
 
-    def _spin(self) -> None:
+    def _repeat(self, do: Callable[[], object]) -> None:
+        """Do something until the end, whatever it raises: a node whose thread ends is deaf."""
         while not self._stop.is_set():
-            self._executor.spin_once(timeout_sec=0.1)
+            try:
+                do()
+            except (InvalidHandle, ExternalShutdownException):
+                self._stop.wait(0.001)  # another thread has destroyed something just now
+            except Exception as error:
+                log_error(self._node, 'a callback failed; the node goes on', error)
 
     def _take_answers(self) -> None:
-        while not self._stop.is_set():
-            clients = [one for one in self._node.clients if one.callback_group is self.answers]
-            if not clients:
-                self._stop.wait(POLL_S)
-                continue
-            with suppress(InvalidHandle):  # of one that was destroyed just now
-                for client in wait_for_some(self._node.context, clients):
-                    header, answer = client.handle.take_response(client.srv_type.Response)
-                    if header is not None:
-                        with suppress(KeyError):  # given up
-                            client.get_pending_request(
-                                header.request_id.sequence_number).set_result(answer)
+        clients = [one for one in self._node.clients if one.callback_group is self.answers]
+        if not clients:
+            self._stop.wait(POLL_S)
+            return
+        for client in wait_for_some(self._node.context, clients):
+            header, answer = client.handle.take_response(client.srv_type.Response)
+            if header is not None:
+                with suppress(KeyError):  # given up
+                    client.get_pending_request(
+                        header.request_id.sequence_number).set_result(answer)
 
 
 def call(client: Client, request: Any, timeout_s: float,

@@ -14,6 +14,7 @@ from typing import Any
 
 import rclpy
 from rclpy import executors
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from tap_ros.contract import NODE_CLASSES
@@ -158,6 +159,8 @@ def _spin_once(executor: executors.Executor, node: Node) -> None:
         executor.spin_once(timeout_sec=0.1)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         raise
+    except InvalidHandle:  # of what another thread destroyed just now
+        pass
     except Exception as error:
         log_error(node, 'a callback failed; the node goes on', error)
 

@@ -9,17 +9,39 @@ import threading
 
 import cv2
 import numpy as np
+from processes import Client, until
 import pytest
+from std_msgs.msg import Bool
 import tap_ros
 from tap_ros.cli import main
 from tap_ros.errors import ConfigError
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.predictor.node import OVERLAY_SCALE
+from tap_ros.nodes.topics import STREAM
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import DEFAULT_PREDICTOR
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.mark.errors('a callback failed')
+def test_nothing_that_fails_makes_a_client_deaf():
+    heard = []
+
+    def fail_once(message):
+        heard.append(message)
+        assert len(heard) > 1, 'the first fails'
+
+    with Client('listener', namespace='/deaf') as node:
+        node.create_subscription(Bool, 'words', fail_once, STREAM)
+        publisher = node.create_publisher(Bool, 'words', STREAM)
+        assert until(publisher.get_subscription_count)
+        for _ in range(200):  # the thread that spins looks at what is destroyed
+            node.destroy_publisher(node.create_publisher(Bool, 'others', STREAM))
+        publisher.publish(Bool())
+        publisher.publish(Bool())
+        assert until(lambda: len(heard) == 2)
 
 
 def test_it_does_with_the_nodes_what_the_classes_do(loop):
