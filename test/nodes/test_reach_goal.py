@@ -249,7 +249,9 @@ def test_a_goal_of_another_program_is_alone_when_nobody_takes_feedback_any_more(
     with Client('planner', namespace=space) as planner, tap_ros.Client(space) as ours:
         with Client('theirs', namespace=space) as theirs:
             theirs.create_subscription(String, topic, print, STREAM)
-            assert ours.goals and until(lambda: planner.count_subscribers(topic) == 2)
+            assert ours.goals and until(lambda: {'theirs', ours.node.get_name()} == {
+                one.node_name for one in planner.get_subscriptions_info_by_topic(
+                    planner.resolve_topic_name(topic))})  # a name comes later than what it has
             gone = watch_sender(planner, bytes(16))
             assert not gone()
         assert until(gone), 'ours listens, too, and has sent no such goal'
