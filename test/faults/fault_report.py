@@ -30,7 +30,7 @@ HEAD = """\
 Each row is a fault that was injected into real nodes, processes of their own that talk over DDS,
 or into a disk. *Held*: trials in which what must happen did happen, and no node logged a traceback
 or an error that the fault does not explain. Numbers are the worst of all trials unless said
-otherwise. Made by `make faults` in {minutes:.0f} minutes, {dates}, commit {commits}, on
+otherwise. Made by `{command}` in {minutes:.0f} minutes, {dates}, commit {commits}, on
 {machines}; [faults.json](faults.json) has each row's. `python -m pytest -m fault` tries each fault
 a few times. Damaged recordings and weights are in `make test`.
 
@@ -181,7 +181,10 @@ def page(rows):
         lines.setdefault((row['injected'], row['promise']), []).append(row)
     missed = [f'- {row["injected"]}: {row["held"]} of {row["tried"]}.\n' for row in rows
               if row['held'] < row['tried']]
-    head = HEAD.format(minutes=sum(row['seconds'] for row in rows) / 60, **{
+    share = min(row['share'] for row in rows)  # of the trials
+    command = 'make faults' + (f' ARGS="--share {share:g}"' if share < 1 else '')
+    minutes = sum(row['seconds'] for row in rows) / 60
+    head = HEAD.format(command=command, minutes=minutes, **{
         f'{key}s': listing(sorted({row[key] for row in rows}))
         for key in ('date', 'commit', 'machine')})
     return head + ''.join(_line(*texts, rows) for texts, rows in lines.items()) + ''.join(
