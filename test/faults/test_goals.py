@@ -386,11 +386,15 @@ def test_goal_given_up(rig, trials):
 @fault('the client is killed during a goal', f'nothing moves later than {NOTICED_S:g} s after '
        'it; aborted; the next goal succeeds', 20, 's until the goal ended')
 def test_client_killed(rig, trials):
+    def deserted():
+        return rig.processes['visual_mpc_node'].text.count('the client that sent')
+
     for trial in trials:
         rig.need('visual_mpc_node', sim='real')
         with trials.one():
             rig.reset(trial)
             rig.arm.forget()
+            count = deserted()
             client = subprocess.Popen([sys.executable, '-c', GOAL_OF_ANOTHER])
             try:
                 assert until(lambda: len(rig.arm.moves(0.0)) > 1, MOVING_S), 'nothing moved'
@@ -398,7 +402,7 @@ def test_client_killed(rig, trials):
                 client.kill()
                 client.wait()
             moment = time.monotonic()
-            rig.processes['visual_mpc_node'].wait_for('the client that sent', 20.0)
+            assert until(lambda count=count: deserted() > count, 20.0)
             trials.measured(time.monotonic() - moment)
             rig.arm.assert_still(moment + NOTICED_S * trials.patience)
             expect_goal(rig)
