@@ -33,6 +33,7 @@ NAMES = (f'red\n{FORGED}', f'\x1b[31m{FORGED}\x1b[0m', f'a\r{FORGED}', f'a\x85{F
 
 @pytest.mark.parametrize('name', ('sim_node', 'predictor_node', 'visual_mpc_node',
                                   'recorder_node'))
+@pytest.mark.errors('nothing was recorded')
 @fault('a node is started and ended at any moment', f'ends within {END_S:g} s, exit code 0 (130 '
        'or the signal while Python imports, 1 of a recorder of nothing), no traceback', 50,
        's until it had ended')
@@ -85,6 +86,7 @@ def test_start_stop(trials, tmp_path, name):
 @pytest.mark.parametrize('given', [
     {'wieghts': 'push2'}, {'weights': 'push2'}, {'image_topic': '/camera/image_raw'}],
     ids=lambda given: next(iter(given)))
+@pytest.mark.errors('nothing was recorded')
 @fault('parameters that a node does not have, or weights by name, to each node', 'it works with '
        'them, or one line in the log names the parameter; no traceback', 2 * len(NODE_CLASSES))
 def test_parameters(trials, tmp_path, given):
