@@ -60,11 +60,11 @@ def predict_fields(**fields):
         goal_objects=goal.object_pixels) | fields
 
 
-def select(client, clicks):
-    """Select objects {name: (u, v)} once the tracker has a picture of the scene."""
+def select(client, clicks, stamp_ns=0):
+    """Select objects {name: (u, v)} once the tracker has a picture of the scene, or that one."""
     def accepted():
         try:
-            client.select(clicks)
+            client.select(clicks, stamp_ns)
         except CallError as error:
             assert 'no picture of the new' in str(error) or 'nothing has come' in str(error)
             return False

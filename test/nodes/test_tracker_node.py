@@ -85,7 +85,7 @@ def scene(sim, client):
 @pytest.mark.errors('goal/image: expected 128x128')
 def test_clicked_objects_are_followed_and_found_in_the_goal(scene, client):
     start_ns, goal_ns = scene.reset()
-    select(scene.client, scene.true_clicks(start_ns))
+    select(scene.client, scene.true_clicks(start_ns), start_ns)
     for topic, stamp in (('objects', start_ns), ('goal/objects', goal_ns)):
         message, names, pixels = scene.at(topic, stamp)
         true, same, wanted = scene.at(f'truth/{topic}', stamp)
@@ -111,7 +111,7 @@ def test_clicked_objects_are_followed_and_found_in_the_goal(scene, client):
 def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(scene):
     start_ns, _ = scene.reset()
     clicks = scene.true_clicks(start_ns)
-    select(scene.client, clicks)
+    select(scene.client, clicks, start_ns)
     scene.at('objects', start_ns)
     first, second = clicks.values()
     for asked, words in (
@@ -347,12 +347,12 @@ def test_what_is_searched_in_a_goal_is_not_told_if_a_scene_begins_meanwhile(clie
 
 def test_another_scene_or_camera_ends_the_selection(scene, client):
     start_ns, goal_ns = scene.reset()
-    select(scene.client, scene.true_clicks(start_ns))
+    select(scene.client, scene.true_clicks(start_ns), start_ns)
     scene.at('goal/objects', goal_ns, lambda m: m.objects)
     start_ns, _ = scene.reset(SEED + 1)
     empty = scene.topics['goal/objects'].wait(10, lambda m: not m.objects)
     assert to_nanoseconds(empty.header.stamp) == goal_ns
-    select(scene.client, scene.true_clicks(start_ns))
+    select(scene.client, scene.true_clicks(start_ns), start_ns)
     scene.at('objects', start_ns)
     client.create_publisher(Image, 'camera/image_raw', STREAM)
     scene.topics['goal/objects'].wait(10, lambda m: not m.objects)
