@@ -129,7 +129,8 @@ def test_of_two_cameras_and_of_what_fails_there_is_no_mask_and_the_reason(client
         assert until(lambda: not node.node._waiting)
     finally:
         assert not node.end()
-    assert capfd.readouterr().err.count('ZeroDivisionError') == 1
+    # Once each: its own, and one that may have been on its way.
+    assert capfd.readouterr().err.count('ZeroDivisionError') in (1, 2)
 
 
 def test_a_bad_start_names_the_parameter():
