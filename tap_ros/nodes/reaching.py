@@ -15,6 +15,7 @@ from typing import Any
 from action_msgs.msg import GoalInfo, GoalStatus
 from action_msgs.srv import CancelGoal
 from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
@@ -30,6 +31,7 @@ STATUS, FEEDBACK = f'{ACTION}/_action/status', f'{ACTION}/_action/feedback'
 CANCEL = f'{ACTION}/_action/cancel_goal'
 CLIENT = 'tap_ros_client_'  # begins the name of a Client's own node
 SENDER_BYTES = 12  # of a goal's id: of its sender's process
+ANSWER_S = 5.0  # until an answer to a goal is held to be lost, and the goal is sent anew
 CANCEL_S = 1.0  # until a cancel that is not answered is sent again
 CLOSE_S = 5.0  # that cancelling may take when a client ends: more than a dead planner's lease
 ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_CANCELED: 'cancelled',
@@ -60,12 +62,14 @@ class Goals:
         self._thread = threading.Thread(target=self._run, name='cancelling', daemon=True)
         self._thread.start()
 
-    def new_id(self) -> bytes:
+    def new_id(self) -> Any:
         """Return the id of a goal; the planner watches whom its first bytes name."""
         own = {one for one, *name in _listeners(self.node)
                if name == [self.node.get_name(), self.node.get_namespace()]}
         sender = own.pop() if len(own) == 1 else secrets.token_bytes(SENDER_BYTES)
-        return sender + secrets.token_bytes(16 - SENDER_BYTES)
+        goal_id = GoalInfo().goal_id
+        goal_id.uuid = list(sender + secrets.token_bytes(16 - SENDER_BYTES))
+        return goal_id
 
     def add(self, goal: 'Reaching') -> None:
         """Become the owner of a goal that is about to be sent."""
@@ -110,11 +114,16 @@ class Goals:
                 self._changed.wait_for(lambda: self._unwanted or self._closed.is_set())
                 goals = list(self._unwanted)
             for goal in goals:
-                with suppress(Exception):  # whatever it is, this goes on until it is answered
-                    if goal.is_cancelled_by(lambda request: call(
-                            self._cancels, request, CANCEL_S, self._closed.is_set)):
-                        self.ended(goal)
+                if self.try_cancel(goal):
+                    self.ended(goal)
             self._closed.wait(POLL_S)
+
+    def try_cancel(self, goal: 'Reaching') -> bool:
+        """Ask once for the end of a goal; return whether nobody can pursue it any more."""
+        with suppress(Exception):  # whatever it is, one asks until it is answered
+            return goal.is_cancelled_by(lambda request: call(
+                self._cancels, request, CANCEL_S, self._closed.is_set))
+        return False
 
 
 @dataclass(frozen=True)
@@ -160,10 +169,9 @@ class Reaching:
         self._deadline = time.monotonic() + timeout_s
         self._feedback: SimpleQueue[Any] = SimpleQueue()
         self._take = on_feedback or self._feedback.put
-        self._id = GoalInfo().goal_id
-        self._id.uuid = list(goals.new_id())
+        self._id = goals.new_id()
         self._lock = threading.Lock()  # nothing is sent after it was given up
-        self._given_up = False
+        self._given_up = self._sent_anew = False
         self._accepted: Future | None = None  # once it was sent
         self._answer: Future | None = None
         self._presence: Presence | None = None  # of the planner that it was sent to
@@ -257,33 +265,53 @@ class Reaching:
                     f'{self._name}: nobody offers it after {accept_s:g} s; start {server.name}')
             time.sleep(POLL_S)
         self._presence = publishers_present(self._goals.node, STATUS)
+        while not (accepted := self._sent(goal, deadline, accept_s)).accepted:
+            if not self._sent_anew or time.monotonic() >= deadline:
+                self._goals.ended(self)
+                raise CallError(f'{self._name}: the goal was rejected; the log of {server.name} '
+                                'says why')
+            time.sleep(CANCEL_S)  # the one whose answer was lost has yet to end
+        self._answer = self._in_executor(accepted.get_result_async, deadline)
+        self._answer.add_done_callback(lambda _: self._goals.ended(self))
+
+    def _sent(self, goal: ReachGoal.Goal, deadline: float, accept_s: float) -> ClientGoalHandle:
+        """
+        Return the planner's answer to the goal.
+
+        An answer is lost when it leaves before the planner has discovered who waits for it. Then
+        the goal is cancelled, and sent anew under another id.
+        """
+        server = self._server
+        while True:
+            answer = self._in_executor(lambda: self._send(goal), deadline)
+            if wait_for_answer(
+                    answer, min(deadline, time.monotonic() + ANSWER_S), f'{self._name}: '
+                    f'{server.name} has left the ROS graph before it answered',
+                    lambda: self.planner_gone):
+                return answer.result()
+            while time.monotonic() < deadline and not self._goals.try_cancel(self):
+                time.sleep(POLL_S)
+            if time.monotonic() >= deadline:
+                raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; '
+                                + (server.silence or f'{server.name} may be busy or stopped'))
+            self._id, self._sent_anew = self._goals.new_id(), True
+
+    def _send(self, goal: ReachGoal.Goal) -> Future:
+        goal_id = self._id
 
         def take(message: Any) -> None:
             try:
-                self._take(message.feedback)
+                if goal_id == self._id:
+                    self._take(message.feedback)
             except Exception as error:  # it would end the thread that spins the node
                 log_error(self._goals.node, f'{self._name}: on_feedback', error)
                 self.cancel()
 
-        def send() -> Future:
-            with self._lock:
-                if self._given_up:
-                    raise CallError(f'{self._name}: given up')
-                self._accepted = self._goals.action.send_goal_async(goal, take, self._id)
-                return self._accepted
-
-        accepted = self._in_executor(send, deadline)
-        if not wait_for_answer(
-                accepted, deadline, f'{self._name}: {server.name} has left the ROS graph before '
-                'it answered', lambda: self.planner_gone):
-            raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; '
-                            + (server.silence or f'{server.name} may be busy or stopped'))
-        if not accepted.result().accepted:
-            self._goals.ended(self)
-            raise CallError(f'{self._name}: the goal was rejected; the log of {server.name} says '
-                            'why')
-        self._answer = self._in_executor(accepted.result().get_result_async, deadline)
-        self._answer.add_done_callback(lambda _: self._goals.ended(self))
+        with self._lock:
+            if self._given_up:
+                raise CallError(f'{self._name}: given up')
+            self._accepted = self._goals.action.send_goal_async(goal, take, goal_id)
+            return self._accepted
 
     def _is_over(self) -> bool:
         """Return whether result would return or raise at once."""

@@ -16,11 +16,14 @@ from loop import acts_like, SEED
 import numpy as np
 from processes import Client, Lifecycle, Newest, until
 import pytest
+from rclpy.action import ActionClient, ActionServer, CancelResponse
+from rclpy.task import Future
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, String
 from tap_msgs.action import ReachGoal
 import tap_ros
 from tap_ros.messages.images import decode_image
+from tap_ros.nodes import reaching
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.planner.plan_view import CHOSEN
@@ -226,6 +229,48 @@ def test_a_goal_whose_client_gave_up_moves_nothing(loop, stands_s):
     assert until(lambda: 'reach_goal ended after 0 steps' in planner.text[log_bytes:], 60)
     served(loop)
     assert len(loop.moves()) == 1
+
+
+@pytest.fixture
+def lost(monkeypatch):
+    """Lose the answer to the first goal; return the answers so far."""
+    monkeypatch.setattr(reaching, 'ANSWER_S', 0.5)
+    send, answers = ActionClient.send_goal_async, []
+
+    def lose(self, *args):
+        answers.append(send(self, *args))
+        return answers[-1] if len(answers) > 1 else Future()
+
+    monkeypatch.setattr(ActionClient, 'send_goal_async', lose)
+    return answers
+
+
+def test_a_goal_whose_answer_is_lost_is_cancelled_and_sent_anew(loop, lost):
+    loop.reset()
+    told = []
+    result = loop.reached(told.append, mode='direct', step_budget=2)
+    assert result.steps == 2 and [each.step for each in told][-2:] == [1, 2]
+    assert lost[0].result().accepted and len(lost) > 1
+    served(loop)
+
+
+def test_a_goal_that_the_planner_could_not_answer_is_sent_anew(lost):
+    """A goal whose answer could not be sent is never executed by rclpy."""
+    space, executed = '/unanswered', []
+
+    def execute(handle):
+        executed.append(bytes(handle.goal_id.uuid))
+        handle.succeed()
+        return ReachGoal.Result(success=True)
+
+    with Client('planner', namespace=space) as planner, tap_ros.Client(space) as client:
+        server = ActionServer(
+            planner, ReachGoal, 'reach_goal', execute,
+            cancel_callback=lambda handle: CancelResponse.ACCEPT,
+            handle_accepted_callback=lambda handle: len(lost) > 1 and handle.execute())
+        assert client.reach(mode='direct').result().success
+        assert len(executed) == 1 and len(lost) == 2
+        server.destroy()
 
 
 @pytest.mark.parametrize('end, why', [
