@@ -12,7 +12,7 @@ DOMAIN := export ROS_DOMAIN_ID=$${ROS_DOMAIN_ID:-$$((1 + $$$$ % 100))}
 
 WHEELS := requirements.txt requirements-dev.txt requirements-experiments.txt requirements-extras.txt \
   requirements-worlds.txt requirements-ros.txt constraints.txt scripts/setup.bash scripts/mend_wheels.py
-SOURCES := package.xml setup.py setup.cfg tap_ros/contract.py resource/tap_ros $(wildcard config/*.yaml config/layouts/* launch/*.py) \
+SOURCES := package.xml setup.py setup.cfg tap_ros/base/contract.py resource/tap_ros $(wildcard config/*.yaml config/layouts/* launch/*.py) \
   tap_msgs/CMakeLists.txt tap_msgs/package.xml $(wildcard tap_msgs/*/*.msg tap_msgs/*/*.srv \
   tap_msgs/*/*.action)
 

@@ -8,7 +8,7 @@ import sys
 from setuptools import find_packages, setup
 
 NAME = 'tap_ros'
-NODE_CLASSES = run_path('tap_ros/contract.py')['NODE_CLASSES']
+NODE_CLASSES = run_path('tap_ros/base/contract.py')['NODE_CLASSES']
 REQUIRED = [  # for pip
     'jinja2>=3.1',
     'lz4>=4.3',
@@ -39,9 +39,8 @@ setup(
     python_requires='>=3.11',
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
     package_data={
-        NAME: ['*.pyi', 'nodes/demo/*.html', 'nodes/explorer/page/*',
-               'nodes/*.xml', 'prediction/page/*', 'py.typed', 'weights/*.md', 'weights/*.png',
-               'weights/*.safetensors'],
+        NAME: ['*.pyi', 'apps/demo/*.html', 'apps/explorer/page/*', 'apps/mark_page/*', 'py.typed',
+               'ros/*.xml', 'weights/*.md', 'weights/*.png', 'weights/*.safetensors'],
         'sim_bridge': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -62,6 +61,6 @@ setup(
     },
     zip_safe=False,
     entry_points={
-        'console_scripts': [f'{name} = tap_ros.nodes.run:main' for name in NODE_CLASSES],
+        'console_scripts': [f'{name} = tap_ros.ros.run:main' for name in NODE_CLASSES],
     },
 )

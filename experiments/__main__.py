@@ -4,7 +4,7 @@
 
 import sys
 
-from tap_ros.cli import CommandLine, EXTRAS, main
+from tap_ros.apps.cli import CommandLine, EXTRAS, main
 
 LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weights again.', {
     'paper': ("make the paper's prediction results again", 'experiments.paper.command'),

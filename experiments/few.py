@@ -19,12 +19,12 @@ from experiments.worlds.trained import held_out_of, mark, MARKED, marks_of
 import numpy as np
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from tap_ros.apps.train import train
-from tap_ros.engines import Engine
-from tap_ros.errors import ConfigError
+from tap_ros.base.engines import Engine
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import write_atomically
+from tap_ros.base.options import Folder
 from tap_ros.evaluation.intervals import against_copying, mean_interval
 from tap_ros.evaluation.prediction import evaluate
-from tap_ros.files import write_atomically
-from tap_ros.options import Folder
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import open_recordings

@@ -19,8 +19,8 @@ import sys
 from experiments.bench.rows import Row
 from experiments.paper.published import BOTTLENECK_2PX, GAINS, TABLE_2
 import pandas as pd
-from tap_ros.errors import ConfigError
-from tap_ros.files import write_atomically
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import write_atomically
 
 RESULTS = Path(__file__).parents[1] / 'docs' / 'results'
 PREDICTION, PLANNING, STACKING = 'prediction.csv', 'planning.json', 'stacking.json'

@@ -17,12 +17,12 @@ from experiments.pages import render, share
 from experiments.tables import find, number
 import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
-from tap_ros.engines import Engine
-from tap_ros.evaluation.command import Tracking
-from tap_ros.evaluation.tracking import draw, score
-from tap_ros.files import write_atomically, write_rows
+from tap_ros.apps.evaluate import Tracking
+from tap_ros.apps.evaluate_tracking import draw, score
+from tap_ros.base.engines import Engine
+from tap_ros.base.files import write_atomically, write_rows
+from tap_ros.base.options import Folder
 from tap_ros.images.drawing import png_bytes
-from tap_ros.options import Folder
 
 SEED = 88_000
 TASKS = ('push2', 'push3', 'order2')

@@ -24,15 +24,15 @@ from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode, TIMINGS
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
 from sim_bridge.world_protocol import ability, make_world, Observation, World
-from tap_ros.engines import Engine, LOCAL, run_tasks, Work
-from tap_ros.errors import check_fields, ConfigError, RecordingError
-from tap_ros.files import only_writer, storage_errors, write_atomically
-from tap_ros.options import Folder, one_of
-from tap_ros.plugins import names
+from tap_ros.base.engines import Engine, LOCAL, run_tasks, Work
+from tap_ros.base.errors import check_fields, ConfigError, RecordingError
+from tap_ros.base.files import only_writer, storage_errors, write_atomically
+from tap_ros.base.options import Folder, one_of
+from tap_ros.base.plugins import names
+from tap_ros.base.text import escaped
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.writer import count_episodes, EpisodeWriter, write_metadata
 from tap_ros.robots.arm import DEFAULT_ARM
-from tap_ros.text import escaped
 from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1

@@ -14,8 +14,8 @@ import numpy as np
 from sim_bridge.demonstrations import to_episode
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.tasks.pushes import Push, push_actions
-from tap_ros.contract import LIFTED
-from tap_ros.errors import SceneError
+from tap_ros.base.contract import LIFTED
+from tap_ros.base.errors import SceneError
 from tap_ros.recording.episode import Episode
 
 TRIES = 20  # a scene without a goal is drawn anew

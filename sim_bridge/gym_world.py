@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.world.camera import OneCamera
 from sim_bridge.world_protocol import clip_action, Observation
-from tap_ros.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.errors import SceneError
+from tap_ros.base.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.errors import SceneError
 
 # m that fingertips stay behind where they shall be; it is made up for. Blocked ones are behind by
 # more, which is forgotten, so that they come back when told to.

@@ -17,13 +17,13 @@ import numpy as np
 from sim_bridge.demonstrations import demonstrate, Demonstration
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera, drawing
-from tap_ros.contract import (
+from tap_ros.base.contract import (
     CONTROL_PERIOD,
     ROBOT_MASK_ARM,
     ROBOT_MASK_FREE,
     ROBOT_MASK_HAND,
 )
-from tap_ros.errors import ConfigError, SceneError
+from tap_ros.base.errors import ConfigError, SceneError
 
 ORIGIN = np.array([0.0, 0.65, 0.01])  # m, of our frame in Meta-World's
 TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about the vertical

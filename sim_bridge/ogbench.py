@@ -15,7 +15,7 @@ import numpy as np
 from sim_bridge.demonstrations import demonstrate, Demonstration
 from sim_bridge.world.camera import Camera, drawing
 from sim_bridge.world_protocol import Observation
-from tap_ros.errors import ConfigError, SceneError
+from tap_ros.base.errors import ConfigError, SceneError
 
 TASKS = ('button', 'cube', 'drawer', 'window')
 FOVY = 45.0  # degrees, of its camera in front

@@ -10,9 +10,9 @@ from sim_bridge.tasks.tasks import get_task, sample_scene, task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, GRIP_SPREAD
 from sim_bridge.world.table import lifted, Table
 from sim_bridge.world_protocol import Observation
-from tap_ros.errors import SceneError
+from tap_ros.base.errors import SceneError
+from tap_ros.base.text import listing
 from tap_ros.robots.arm import DEFAULT_ARM
-from tap_ros.text import listing
 
 
 class Simulator(Table):

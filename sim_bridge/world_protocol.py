@@ -8,9 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import ACTION_LIMIT
-from tap_ros.errors import SceneError
-from tap_ros.plugins import load_plugin
+from tap_ros.base.contract import ACTION_LIMIT
+from tap_ros.base.errors import SceneError
+from tap_ros.base.plugins import load_plugin
 from tap_ros.robots.arm import Arm
 
 

@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 
-from tap_ros.contract import NODE_CLASSES
+from tap_ros.base.contract import NODE_CLASSES
 
 
 def leave_at_once(*_: object) -> None:
@@ -54,7 +54,7 @@ if not os.access(_home, os.W_OK):
 # What most users need; each is imported when it is asked for, so that nodes stay light.
 _EXPORTS = {
     'Arm': 'tap_ros.robots.arm',
-    'Client': 'tap_ros.nodes.client',
+    'Client': 'tap_ros.ros.client',
     'EpisodeWriter': 'tap_ros.recording.writer',
     'ForwardModel': 'tap_ros.planning.protocols',
     'iter_episodes': 'tap_ros.recording.reader',
@@ -63,7 +63,7 @@ _EXPORTS = {
     'Simulator': 'sim_bridge.simulator',
     'Solver': 'tap_ros.planning.protocols',
     'SubgoalPredictor': 'tap_ros.prediction.predictor',
-    'TapError': 'tap_ros.errors',
+    'TapError': 'tap_ros.base.errors',
     'train': 'tap_ros.apps.train',
     'VisualMPC': 'tap_ros.planning.visual_mpc',
     'World': 'sim_bridge.world_protocol',

@@ -5,8 +5,7 @@
 from sim_bridge.simulator import Simulator as Simulator
 from sim_bridge.world_protocol import World as World
 from tap_ros.apps.train import train as train
-from tap_ros.errors import TapError as TapError
-from tap_ros.nodes.client import Client as Client
+from tap_ros.base.errors import TapError as TapError
 from tap_ros.planning.protocols import ForwardModel as ForwardModel
 from tap_ros.planning.protocols import Solver as Solver
 from tap_ros.planning.visual_mpc import VisualMPC as VisualMPC
@@ -16,5 +15,6 @@ from tap_ros.recording.cache import open_recordings as open_recordings
 from tap_ros.recording.reader import iter_episodes as iter_episodes
 from tap_ros.recording.writer import EpisodeWriter as EpisodeWriter
 from tap_ros.robots.arm import Arm as Arm
+from tap_ros.ros.client import Client as Client
 
 def leave_at_once(*_: object) -> None: ...

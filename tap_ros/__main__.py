@@ -4,6 +4,6 @@
 
 import sys
 
-from tap_ros.cli import main
+from tap_ros.apps.cli import main
 
 sys.exit(main())

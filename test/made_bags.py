@@ -12,7 +12,7 @@ import warnings
 from made_episodes import assert_all_equal
 from mcap.writer import Writer
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS
+from tap_ros.base.contract import GRIPPER_JOINTS
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import encode, schema_text
 from tap_ros.recording.writer import BagWriter

@@ -5,7 +5,7 @@
 import dataclasses
 
 import numpy as np
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
+from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 

@@ -20,9 +20,9 @@ from rclpy.context import Context
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from tap_ros.nodes.calls import call, CallError, Spinner
-from tap_ros.nodes.heartbeat import Heartbeat
-from tap_ros.nodes.node_processes import errors_in
+from tap_ros.apps.node_processes import errors_in
+from tap_ros.ros.calls import call, CallError, Spinner
+from tap_ros.ros.heartbeat import Heartbeat
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 5.0  # a time-out says that a test has failed, not how fast the machine is

@@ -12,8 +12,8 @@ from experiments.bench.rows import Row, show
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import task_names
-from tap_ros.engines import Engine
-from tap_ros.options import one_of
+from tap_ros.base.engines import Engine
+from tap_ros.base.options import one_of
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 import platform
 import time
 
-from tap_ros.files import write_atomically
+from tap_ros.base.files import write_atomically
 import torch
 
 PARTS = ('collect', 'recording', 'training', 'planning', 'nodes.service')

@@ -7,9 +7,9 @@ Unlike cem.py, all samples count, each by its cost, the deviation stays, and the
 """
 
 import numpy as np
+from tap_ros.base.search import cross_entropy, finite
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
 from tap_ros.planning.solvers.cem import judged_once_more, proposed
-from tap_ros.search import cross_entropy, finite
 
 TEMPERATURE = 0.1  # in distances from the least cost to the median
 

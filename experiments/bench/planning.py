@@ -9,11 +9,11 @@ from experiments.bench.mppi import mppi
 from experiments.bench.rows import Row, show
 import numpy as np
 from sim_bridge.simulator import Simulator
-from tap_ros.contract import CLEAR
-from tap_ros.errors import PlanningError
+from tap_ros.base.contract import CLEAR
+from tap_ros.base.errors import PlanningError
+from tap_ros.base.options import ShippedFile
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.images.pixels import to_float
-from tap_ros.options import ShippedFile
 from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.mpc_config import FIRST_SCENE, PRESETS, with_preset, with_samples
 from tap_ros.planning.mpc_inputs import Scene

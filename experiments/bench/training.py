@@ -13,11 +13,11 @@ import time
 from typing import Annotated
 
 from experiments.bench.rows import Row, show
-from tap_ros.options import Bags
-from tap_ros.prediction.methods import method_fields
-from tap_ros.prediction.training import train
-from tap_ros.prediction.training_config import TrainingConfig
-from tap_ros.training.devices import has_bfloat16, pick_device, pick_precision
+from tap_ros.base.options import Bags
+from tap_ros.training.methods import method_fields
+from tap_ros.training.predictor import train
+from tap_ros.training.predictor_config import TrainingConfig
+from tap_ros.weights.devices import has_bfloat16, pick_device, pick_precision
 import torch
 from tyro import conf
 

@@ -9,9 +9,9 @@ from typing import Annotated
 from experiments.paper.runs import paper_runs
 from experiments.paper.sweep import find_result, Places, sweep
 import numpy as np
-from tap_ros.engines import Engine
-from tap_ros.errors import ConfigError
-from tap_ros.options import Flag
+from tap_ros.base.engines import Engine
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.options import Flag
 from tyro import conf
 
 

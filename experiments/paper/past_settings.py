@@ -4,8 +4,8 @@
 
 from dataclasses import asdict
 
-from tap_ros.prediction.methods import method_fields
-from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.training.methods import method_fields
+from tap_ros.training.predictor_config import TrainingConfig
 
 # Settings of earlier versions, and the value that they have now, or at which they did nothing.
 _GONE = {'bell_edge': 2 / 3, 'changed_weight': 0.0, 'match_temperature': 0.0, 'match_share': 0.5,

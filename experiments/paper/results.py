@@ -9,8 +9,8 @@ from experiments.paper import figures
 from experiments.paper.pictures import write_picture
 from experiments.paper.rows import as_frame, COPIES, group_runs, make_rows
 from experiments.paper.runs import label
-from tap_ros.errors import ConfigError
-from tap_ros.files import write_atomically
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import write_atomically
 
 _KEYS = {'name', 'task', 'mode', 'method', 'new_pixels', 'seed', 'scale', 'command', 'config',
          'data', 'training', 'evaluation'}

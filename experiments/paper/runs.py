@@ -7,8 +7,8 @@ from pathlib import Path
 
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED, TIMED
 from sim_bridge.tasks.tasks import get_task
-from tap_ros.prediction.methods import method_fields
-from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.training.methods import method_fields
+from tap_ros.training.predictor_config import TrainingConfig
 
 SINGLE = ('grasp', 'pick_place', 'push2')  # the tasks of Table 1
 MAIN_SEEDS = (0, 1, 2)

@@ -7,19 +7,19 @@ import time
 
 from experiments.paper.runs import SCALE
 import numpy as np
-from tap_ros.errors import ConfigError
+from tap_ros.base.errors import ConfigError
 from tap_ros.evaluation.bottleneck import MIN_MOTION, target_bottlenecks
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
-from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training.devices import pick_device
+from tap_ros.training.batches import make_batch, Sampling
 from tap_ros.training.split import split_episodes
-from tap_ros.training.weights import stored_digest
 from tap_ros.weights import find_predictor
+from tap_ros.weights.devices import pick_device
+from tap_ros.weights.weights import stored_digest
 import torch
 
 LEVELS = 2  # of recursion

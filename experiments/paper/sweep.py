@@ -15,10 +15,10 @@ from experiments.paper.past_settings import todays_settings
 from experiments.paper.recordings import RECORDINGS
 from experiments.paper.runs import SCALE
 from sim_bridge.collect import collect, SETTINGS_FILE
-from tap_ros.engines import LOCAL, run_tasks, Work
-from tap_ros.errors import TapError
-from tap_ros.files import write_atomically
-from tap_ros.options import Folder
+from tap_ros.base.engines import LOCAL, run_tasks, Work
+from tap_ros.base.errors import TapError
+from tap_ros.base.files import write_atomically
+from tap_ros.base.options import Folder
 from tap_ros.training.run_config import FREE
 from tqdm import tqdm
 
@@ -91,7 +91,7 @@ def sweep(runs, places, engine=LOCAL):
 def perform(run, places):
     """Train a PaperRun, or go on with it, score it and write its result."""
     from experiments.paper.score import score  # torch takes seconds, a list does without
-    from tap_ros.prediction.training import train
+    from tap_ros.training.predictor import train
 
     config = run.config(places.recordings, places.runs)
     weights = train(config, progress=False)

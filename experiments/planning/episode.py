@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 from experiments.planning.following import Follower
 import numpy as np
-from tap_ros.contract import GOAL_TOLERANCE
-from tap_ros.errors import ConfigError, TrackingError
+from tap_ros.base.contract import GOAL_TOLERANCE
+from tap_ros.base.errors import ConfigError, TrackingError
+from tap_ros.images.robot_mask import FreeView, trained_robot_mask
 from tap_ros.planning.action_sequences import DOWN
 from tap_ros.planning.cost import BLOCKED
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
 from tap_ros.planning.visual_mpc import SHORT
-from tap_ros.training.robot_mask import FreeView, trained_robot_mask
 
 
 @dataclass

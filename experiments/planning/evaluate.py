@@ -10,8 +10,8 @@ from experiments.planning.methods import FIRST_SCENES, parse_method, STACKING_TA
 from experiments.planning.results import make_rows, make_stack_rows
 from experiments.planning.runs import Job, load_results, run_jobs
 from sim_bridge.world.looks import DEFAULT_LOOK
-from tap_ros.errors import ConfigError
-from tap_ros.files import write_rows
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import write_rows
 from tap_ros.planning.mpc_config import with_preset
 from tap_ros.weights import find_predictor, FORWARD_MODEL
 

@@ -4,8 +4,8 @@
 
 from experiments.planning.runs import make_episode
 import numpy as np
-from tap_ros.errors import ConfigError
-from tap_ros.files import write_atomically
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import write_atomically
 from tap_ros.images.drawing import draw_crosses, enlarge, film_strip, grid, png_bytes
 
 SAME_CM = 0.01

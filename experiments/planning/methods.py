@@ -16,9 +16,9 @@ has to be moved first, and 'true_places' also where to, from no picture.
 from dataclasses import dataclass, fields, replace
 import re
 
-from tap_ros.errors import ConfigError
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.plugins import names
 from tap_ros.planning.mpc_config import FIRST_SCENE, PLANNING_TASKS, with_samples
-from tap_ros.plugins import names
 
 STACKING_TASKS = ('stack3', 'stack2', 'pick_place')
 TASKS = (*PLANNING_TASKS, *STACKING_TASKS)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from experiments.planning.methods import BASES, DEFAULTS, parse_method, SUBGOALS_ONLY
 import pandas as pd
 from scipy.stats import sem
-from tap_ros.contract import SUCCESS_DISTANCE
+from tap_ros.base.contract import SUCCESS_DISTANCE
 from tap_ros.evaluation.intervals import mean_interval, share_interval
 
 # Results are compared where these settings agree; what an option changes is not among them.

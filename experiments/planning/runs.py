@@ -18,17 +18,17 @@ import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task
 from sim_bridge.world.looks import DEFAULT_LOOK
-from tap_ros.contract import GOAL_TOLERANCE, step_budget
-from tap_ros.engines import LOCAL, run_tasks, Work
-from tap_ros.errors import ConfigError, ImageError, PlanningError
-from tap_ros.files import write_atomically
+from tap_ros.base.contract import GOAL_TOLERANCE, step_budget
+from tap_ros.base.engines import LOCAL, run_tasks, Work
+from tap_ros.base.errors import ConfigError, ImageError, PlanningError
+from tap_ros.base.files import write_atomically
+from tap_ros.base.plugins import load_plugin
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
-from tap_ros.plugins import load_plugin
 from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.training.weights import stored_digest
 from tap_ros.weights import FORWARD_MODEL
+from tap_ros.weights.weights import stored_digest
 import torch
 from tqdm import tqdm
 

@@ -14,9 +14,9 @@ from experiments.planning.reading import Move, PictureReader, read_moves
 import numpy as np
 from sim_bridge.tasks.stack import on_table, PickAndPlace
 from sim_bridge.tasks.tasks import run_episode as run_expert
-from tap_ros.contract import LIFTED, SUCCESS_DISTANCE
-from tap_ros.errors import ConfigError
-from tap_ros.training.robot_mask import FreeView
+from tap_ros.base.contract import LIFTED, SUCCESS_DISTANCE
+from tap_ros.base.errors import ConfigError
+from tap_ros.images.robot_mask import FreeView
 
 OVER = 0.045  # m; an object whose place is nearer to another one, from above, is put on that
 ARRIVED = 0.01  # m from its last place, then an object of the expert's is where it goes

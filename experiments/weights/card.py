@@ -8,15 +8,15 @@ from pathlib import Path
 from experiments.pages import render
 import numpy as np
 import pandas as pd
+from tap_ros.base.files import write_atomically
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.samples import SAMPLES, score_samples
 from tap_ros.evaluation.shown import SHOWN
 from tap_ros.evaluation.strips import write_strips
-from tap_ros.files import write_atomically
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training.weights import load_weights, save_weights
+from tap_ros.weights.weights import load_weights, save_weights
 import torch
 
 THRESHOLD = 2  # px, of the bottleneck frequency on the card

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from sim_bridge.collect import collect, CollectConfig
 from tap_ros.apps.train import train
-from tap_ros.options import Flag, Folder, one_of
+from tap_ros.base.options import Flag, Folder, one_of
 
 FRESH_SEED, FRESH_EPISODES = 900_000, 100  # of the scenes that weights are scored in
 # Of each recipe: the task, and by the names of their folders what is recorded to train on, options

@@ -24,17 +24,17 @@ from experiments.worlds.trained import (
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
-from tap_ros.engines import Engine
-from tap_ros.errors import ConfigError
+from tap_ros.base.engines import Engine
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import write_atomically, write_rows
+from tap_ros.base.options import Flag, Folder
 from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
-from tap_ros.files import write_atomically, write_rows
 from tap_ros.images.drawing import grid
-from tap_ros.options import Flag, Folder
-from tap_ros.prediction.marks import chance
-from tap_ros.prediction.training_config import RECIPES
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.recording.reading import Reading
+from tap_ros.training.marks import chance
+from tap_ros.training.predictor_config import RECIPES
 
 Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'fix to marks']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',

@@ -22,13 +22,13 @@ from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.gym_pushes import push_to_goal
 from sim_bridge.world_protocol import make_world
 from tap_ros.apps.train import train
-from tap_ros.contract import ACTION_LIMIT, step_budget
-from tap_ros.engines import Engine
-from tap_ros.errors import SceneError
+from tap_ros.base.contract import ACTION_LIMIT, step_budget
+from tap_ros.base.engines import Engine
+from tap_ros.base.errors import SceneError
+from tap_ros.base.files import write_atomically, write_rows
+from tap_ros.base.options import Flag, Folder
 from tap_ros.evaluation.intervals import mean_interval, share_interval
-from tap_ros.files import write_atomically, write_rows
 from tap_ros.images.drawing import enlarge, grid
-from tap_ros.options import Flag, Folder
 from tap_ros.planning.mpc_config import FIRST_SCENE, VisualMPCConfig
 from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.visual_mpc import VisualMPC

@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 import numpy as np
-from tap_ros.engines import run_tasks, Work
-from tap_ros.files import write_atomically
+from tap_ros.base.engines import run_tasks, Work
+from tap_ros.base.files import write_atomically
 from tqdm import tqdm
 
 MARKED = 10  # demonstrations of each task, others in each training

@@ -17,12 +17,12 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from sim_bridge.world_protocol import ability, Observation, World
 from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates
-from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
+from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.messages import topics
-from tap_ros.nodes import ros_messages
-from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.robots.arm import Transform
 from tap_ros.robots.description import robot_description
+from tap_ros.ros import ros_messages
+from tap_ros.ros.topics import LATCHED, STREAM
 
 STREAMS = {'clock': Clock, 'joint_states': JointState, 'objects': ObjectStates,
            'camera/camera_info': CameraInfo, 'camera/robot_mask': Image, 'camera/image_raw': Image}

@@ -19,18 +19,18 @@ from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode
 from tap_msgs.srv import ResetScene, SetGoal, StepScene
-from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORLD_FRAME
-from tap_ros.errors import TapError
+from tap_ros.base.contract import ACTION_LIMIT, CONTROL_PERIOD, WORLD_FRAME
+from tap_ros.base.errors import TapError
+from tap_ros.base.plugins import names
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.observations import reception_time
-from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.services import answering
-from tap_ros.nodes.subscriptions import steady_timer
-from tap_ros.nodes.topics import LATCHED, LOCK_STEP, SERVICE_QOS, STREAM, to_stamp
-from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
+from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.observations import reception_time
+from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.services import answering
+from tap_ros.ros.subscriptions import steady_timer
+from tap_ros.ros.topics import LATCHED, LOCK_STEP, SERVICE_QOS, STREAM, to_stamp
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later

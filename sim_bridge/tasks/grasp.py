@@ -40,14 +40,14 @@ from sim_bridge.world.scene import (
 )
 from sim_bridge.world.table import GRIPPER_HEIGHT, OBJECT_QPOS_START, ramp_controls, Table
 from sim_bridge.world_protocol import Observation
-from tap_ros.contract import (
+from tap_ros.base.contract import (
     CLEAR,
     MOVE_LIMIT,
     SUCCESS_DISTANCE,
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
 )
-from tap_ros.search import cross_entropy
+from tap_ros.base.search import cross_entropy
 
 GRASP_YAW = 0.45  # rad, largest angle between y and the part to be held
 FINGER_DEPTH = 0.022  # m, thickness of a finger and a little room

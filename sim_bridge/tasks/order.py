@@ -20,7 +20,7 @@ from sim_bridge.tasks.push import GOAL_DISTANCE, OBJECT_RANGE, PushTask, with_ya
 from sim_bridge.tasks.tasks import apart, TaskScene
 from sim_bridge.world.scene import ObjectShape, random_shape
 from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE
-from tap_ros.contract import WORKSPACE_HIGH
+from tap_ros.base.contract import WORKSPACE_HIGH
 
 EDGE_RANGE = (0.35, 0.38)  # m from the middle, where the object at the edge stands
 OUTWARDS = 0.35  # rad, largest angle between the edge's normal and the way onto that place

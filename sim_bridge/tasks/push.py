@@ -49,8 +49,8 @@ from sim_bridge.tasks.tasks import (
 from sim_bridge.world.scene import random_shape
 from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE, lifted, Table
 from sim_bridge.world_protocol import Observation
-from tap_ros.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.search import cross_entropy
+from tap_ros.base.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.search import cross_entropy
 
 OBJECT_RANGE = 0.35  # m, |x| and |y| of object origins at start and goal
 GOAL_DISTANCE = 0.2  # m from start to goal of every object that is pushed

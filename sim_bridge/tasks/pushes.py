@@ -9,7 +9,7 @@ from typing import NamedTuple, TYPE_CHECKING
 import numpy as np
 from sim_bridge.tasks.tasks import moves, straight
 from sim_bridge.world.table import divided, OBJECT_QPOS_START, ramp_controls, SUBSTEPS, Table
-from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
 
 if TYPE_CHECKING:
     from sim_bridge.tasks.push import Expert

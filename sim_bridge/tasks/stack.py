@@ -27,7 +27,7 @@ from sim_bridge.tasks.tasks import (
 from sim_bridge.world.scene import HALF_HEIGHT, ObjectShape
 from sim_bridge.world.table import GRIPPER_HEIGHT, Table
 from sim_bridge.world_protocol import Observation
-from tap_ros.contract import CLEAR
+from tap_ros.base.contract import CLEAR
 
 BLOCK_HALF_WIDTH = (0.026, 0.032)  # m
 BLOCK_RANGE = 0.2  # m, |x| and |y| of the blocks

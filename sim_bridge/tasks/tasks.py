@@ -15,9 +15,9 @@ import numpy as np
 from sim_bridge.world.scene import ObjectShape
 from sim_bridge.world.table import divided, Table
 from sim_bridge.world_protocol import Observation
-from tap_ros.contract import SUCCESS_DISTANCE, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.errors import ConfigError, SceneError
-from tap_ros.plugins import load_plugin, names
+from tap_ros.base.contract import SUCCESS_DISTANCE, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.errors import ConfigError, SceneError
+from tap_ros.base.plugins import load_plugin, names
 
 Place = tuple[float, float, float]
 TIMINGS = ('natural', 'early', 'middle', 'late', 'mixed')  # of bottlenecks, see push.py

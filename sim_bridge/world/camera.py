@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge import GL_PROBLEM
 from sim_bridge.world.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
-from tap_ros.errors import SceneError
-from tap_ros.text import escaped
+from tap_ros.base.errors import SceneError
+from tap_ros.base.text import escaped
 
 
 @dataclass(frozen=True)

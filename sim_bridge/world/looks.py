@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
-from tap_ros.errors import SceneError
+from tap_ros.base.errors import SceneError
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS
+from tap_ros.base.contract import GRIPPER_JOINTS
 
 SHAPES = ('L', 'T', 'bar', 'disc')
 HALF_HEIGHT = 0.03  # m, of every object

@@ -19,8 +19,8 @@ import numpy as np
 from sim_bridge.world.camera import Camera, OpenGL
 from sim_bridge.world.looks import Appearance, USUAL
 from sim_bridge.world.scene import ARM_GEOM_GROUP
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.errors import SceneError
+from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.base.errors import SceneError
 from tap_ros.robots.arm import Arm
 
 SAMPLES = 2  # along each side of a pixel

@@ -22,8 +22,8 @@ from sim_bridge.world.scene import (
 )
 from sim_bridge.world.studio import Studio
 from sim_bridge.world_protocol import clip_action, Observation
-from tap_ros.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.errors import KinematicsError, SceneError
+from tap_ros.base.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.errors import KinematicsError, SceneError
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)

@@ -9,12 +9,12 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
 
-from tap_ros.errors import ConfigError, TapError
-from tap_ros.planning import forward_training_config
-from tap_ros.planning.forward_training_config import ForwardTrainingConfig
-from tap_ros.prediction import training_config
-from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.recording.reading import reading_of
+from tap_ros.training import forward_config as forward_training_config
+from tap_ros.training import predictor_config as training_config
+from tap_ros.training.forward_config import ForwardTrainingConfig
+from tap_ros.training.predictor_config import TrainingConfig
 from tap_ros.weights import find_predictor
 
 Model = Literal['predictor', 'forward']
@@ -37,7 +37,7 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
     :param recordings: one or several: bag folders, folders of these, or .mcap files.
     :param out: the run's folder; by default runs/predictor or runs/forward.
     :param model: 'predictor' or 'forward'.
-    :param recipe: its name, see prediction/training_config.py; by default that of the task that
+    :param recipe: its name, see training/predictor_config.py; by default that of the task that
         the recordings name, else with marks 'foreign', else push2's.
     :param settings: other settings than the recipe's: fields of TrainingConfig, or of
         ForwardTrainingConfig. Initial weights bring the network's shape and the pictures' size.
@@ -90,7 +90,7 @@ def _shape(asked: Config) -> dict[str, Any]:
     """Return the shape of a predictor's initial weights; where it cannot be read, the run says."""
     if isinstance(asked, TrainingConfig) and asked.initial_weights:
         with suppress(TapError):
-            from tap_ros.training.weights import load_weights  # torch takes seconds to import
+            from tap_ros.weights.weights import load_weights  # torch takes seconds to import
             shape = load_weights(find_predictor(asked.initial_weights), 'predictor')[0]
             names = {'image_size': 'size', **{name: name for name in (
                 'base_width', 'new_pixels', 'decoder', 'skips')}}
@@ -115,9 +115,9 @@ def _recipe_of(asked: Config, recipes: dict[str, Any]) -> str:
 def _train(config: Config) -> str:
     """Train with settings; return the path of the weights."""
     if isinstance(config, TrainingConfig):
-        from tap_ros.prediction.training import train  # torch takes seconds to import
+        from tap_ros.training.predictor import train  # torch takes seconds to import
         return train(config)
-    from tap_ros.planning.forward_training import train as train_forward
+    from tap_ros.training.forward import train as train_forward
     return train_forward(config)
 
 

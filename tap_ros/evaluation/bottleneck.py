@@ -12,10 +12,10 @@ from typing import TypeAlias
 
 import numpy as np
 from tap_ros.planning.cost import distances_to_pixels
-from tap_ros.prediction.batches import fixed_time, uses_recorded_goal
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps, WarpedMaps
 from tap_ros.recording.episode import Episode
+from tap_ros.training.batches import fixed_time, uses_recorded_goal
 import torch
 
 THRESHOLDS = tuple(range(11))  # px

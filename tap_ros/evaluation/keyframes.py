@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
-from tap_ros.prediction.marks import chance, features_of
+from tap_ros.images.robot_mask import trained_robot_mask
 from tap_ros.prediction.nearest_keyframe import halfway, l1_distance
-from tap_ros.prediction.preference import describe, learn_preference, Preference, SIZE
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.recording.marks import Mark, Marks
-from tap_ros.training.robot_mask import trained_robot_mask
+from tap_ros.training.marks import chance, features_of
+from tap_ros.training.preference import describe, learn_preference, Preference, SIZE
 
 ASIDE = 0.1  # share of the way in pictures that slowest stays away from start and goal
 SMOOTH = np.ones(3) / 3

@@ -24,12 +24,12 @@ from tap_ros.evaluation.samples import draw_latents
 from tap_ros.evaluation.shown import SHOWN, ShownScorer
 from tap_ros.images.pixels import to_float
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.prediction.batches import Batch, make_batch, Pictures, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.protocol import Predictor, Question
 from tap_ros.prediction.warp import WarpedMaps
 from tap_ros.recording.cache import EpisodeStore
+from tap_ros.training.batches import Batch, make_batch, Pictures, Sampling
 from tap_ros.training.inpainted import Filled
 import torch
 

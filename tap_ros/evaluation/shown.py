@@ -11,9 +11,9 @@ recordings'; they score only.
 
 import cv2
 import numpy as np
-from tap_ros.contract import ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.base.contract import ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.images.robot_mask import fill_in_time
 from tap_ros.recording.episode import Episode
-from tap_ros.training.robot_mask import fill_in_time
 
 SHOWN = 0.5  # least share of the contrast of what counts as shown
 OBJECT_RADIUS = 7.0  # px around an object's pixel, in pictures of 64 px

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from tap_ros.base.files import write_atomically
 from tap_ros.evaluation.bottleneck import context_pixels
 from tap_ros.evaluation.keyframes import is_hit, SMOOTH
 from tap_ros.evaluation.prediction import ask, is_forward
-from tap_ros.files import write_atomically
 from tap_ros.images.drawing import enlarge, GAP, grid, overlay, png_bytes
 from tap_ros.images.pixels import to_uint8
-from tap_ros.prediction.batches import make_batch, Pictures, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.protocol import Predictor
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.recording.marks import Mark, Marks
+from tap_ros.training.batches import make_batch, Pictures, Sampling
 from tap_ros.training.inpainted import Filled
 import torch
 

@@ -23,11 +23,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from tap_ros.errors import ConfigError, TrackingError
+from tap_ros.base.errors import ConfigError, TrackingError
+from tap_ros.base.text import escaped
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import make_episode, video_frames
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.text import escaped
 from tap_ros.tracking.protocols import LOST, SEEN, Tracked, Tracker, View
 
 SIDE = 64  # errors are in pixels of a picture so many pixels wide

@@ -13,10 +13,10 @@ import re
 from typing import Any
 
 import numpy as np
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.errors import ConfigError, ImageError
+from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.base.errors import ConfigError, ImageError
+from tap_ros.base.text import escaped
 from tap_ros.images.pixels import resize_image, resize_pixels
-from tap_ros.text import escaped
 
 CENTRE = 'centre'
 MAX_SIZE = 4096  # px, of a side

@@ -13,9 +13,9 @@ import struct
 from typing import NamedTuple
 
 import numpy as np
-from tap_ros.contract import MAX_PICTURE_BYTES
-from tap_ros.errors import ImageError
-from tap_ros.text import escaped
+from tap_ros.base.contract import MAX_PICTURE_BYTES
+from tap_ros.base.errors import ImageError
+from tap_ros.base.text import escaped
 
 
 class Encoding(NamedTuple):

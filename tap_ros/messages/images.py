@@ -8,12 +8,12 @@ import sys
 from typing import Any
 
 import numpy as np
-from tap_ros.contract import MAP_ENCODING, MASK_ENCODING, MAX_PICTURE_BYTES, PICTURE_ENCODING
-from tap_ros.errors import ImageError
+from tap_ros.base.contract import MAP_ENCODING, MASK_ENCODING, MAX_PICTURE_BYTES, PICTURE_ENCODING
+from tap_ros.base.errors import ImageError
+from tap_ros.base.text import escaped
 from tap_ros.images.encodings import decompress, find_encoding, to_rgb
 from tap_ros.images.pixels import check_image, check_mask
 from tap_ros.messages.stamps import header_fields, Stamp
-from tap_ros.text import escaped
 
 MAX_FRAME_ID = 100  # characters; it comes back with every picture and map of an answer
 MAX_PIXELS = 2**24  # of a camera

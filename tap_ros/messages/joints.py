@@ -15,11 +15,11 @@ import threading
 from typing import Any
 
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS
-from tap_ros.errors import KinematicsError, PlanningError
+from tap_ros.base.contract import GRIPPER_JOINTS
+from tap_ros.base.errors import KinematicsError, PlanningError
+from tap_ros.base.text import listing
 from tap_ros.messages.stamps import header_fields, MAX_GAP, PROOF, Stamp, to_nanoseconds
 from tap_ros.robots.arm import Arm
-from tap_ros.text import listing
 
 PLACE, OPENING = GRIPPER_JOINTS[:3], GRIPPER_JOINTS[3]
 KEPT_NS = 5 * 10**9  # what is older than the newest state by more is forgotten

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from tap_ros.errors import PlanningError
+from tap_ros.base.errors import PlanningError
+from tap_ros.base.text import escaped
 from tap_ros.messages.images import decode_image, decode_map, image_fields, map_fields
 from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import header_fields, Stamp
-from tap_ros.text import escaped
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@
 
 import sys
 
-from tap_ros.contract import NODE_CLASSES
-from tap_ros.nodes.run import main
+from tap_ros.base.contract import NODE_CLASSES
+from tap_ros.ros.run import main
 
 if __name__ == '__main__':
     if len(sys.argv) < 2 or sys.argv[1] not in NODE_CLASSES:

@@ -19,7 +19,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import (
+from tap_ros.base.contract import (
     ACTION_LIMIT,
     CLIMB_LIMIT,
     LIFTED,

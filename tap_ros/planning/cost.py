@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.table import pixel_points
 import torch

@@ -25,9 +25,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from tap_ros.contract import ACTION_LIMIT, CLEAR, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.errors import check_fields, ConfigError
+from tap_ros.base.contract import ACTION_LIMIT, CLEAR, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.errors import check_fields, ConfigError
 from tap_ros.images.crop import Crop, TrainedCrop
+from tap_ros.images.robot_mask import RobotMask
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
 from tap_ros.planning.table import (
     grid_points,
@@ -38,9 +39,8 @@ from tap_ros.planning.table import (
     shifted,
     Table,
 )
-from tap_ros.training.devices import has_bfloat16, placed
-from tap_ros.training.robot_mask import RobotMask
-from tap_ros.training.weights import load_weights, make_network
+from tap_ros.weights.devices import has_bfloat16, placed
+from tap_ros.weights.weights import load_weights, make_network
 import torch
 from torch import nn
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import GOAL_TOLERANCE
-from tap_ros.errors import ConfigError
+from tap_ros.base.contract import GOAL_TOLERANCE
+from tap_ros.base.errors import ConfigError
 from tap_ros.planning.action_sequences import FULL, gripper_after, Limits
 from tap_ros.planning.cost import distances_to_all_pixels
 from tap_ros.planning.mpc_config import SWITCHES

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from tap_ros.errors import check_fields, ConfigError
+from tap_ros.base.errors import check_fields, ConfigError
 from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.protocols import SearchConfig, Solver
 

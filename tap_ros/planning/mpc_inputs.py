@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.errors import PlanningError
+from tap_ros.base.errors import PlanningError
 from tap_ros.images.pixels import check_image, check_pixels, in_picture
 from tap_ros.planning.cost import distances_to_places
 from tap_ros.planning.table import Table

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What can be put in the planner's place: a forward model, a solver. Names: tap_ros.plugins."""
+"""Forward models and solvers of the planner; tap_ros.base.plugins gives them names."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from math import inf
 from typing import Any, Protocol, runtime_checkable, TYPE_CHECKING
 
 import numpy as np
-from tap_ros.errors import check_fields
+from tap_ros.base.errors import check_fields
 
 if TYPE_CHECKING:
     from tap_ros.planning.table import Table

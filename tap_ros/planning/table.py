@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS, ROBOT_MASK_HAND
-from tap_ros.errors import RecordingError
+from tap_ros.base.contract import GRIPPER_JOINTS, ROBOT_MASK_HAND
+from tap_ros.base.errors import RecordingError
 import torch
 from torch.nn import functional as F
 

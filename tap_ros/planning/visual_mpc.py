@@ -25,8 +25,10 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import LOW
-from tap_ros.errors import PlanningError
+from tap_ros.base.contract import LOW
+from tap_ros.base.errors import PlanningError
+from tap_ros.base.plugins import load_plugin
+from tap_ros.base.search import finite
 from tap_ros.images.pixels import to_float
 from tap_ros.planning.action_sequences import (
     DOWN,
@@ -44,8 +46,6 @@ from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import check_scene, Goal, Scene, tabulate
 from tap_ros.planning.protocols import ForwardModel, Problem, Solution, Solver
-from tap_ros.plugins import load_plugin
-from tap_ros.search import finite
 import torch
 
 WARM_STD = 0.5  # share of the first deviation that a search around the last plan begins with

@@ -7,7 +7,7 @@ import os
 from typing import Any, Self
 
 import numpy as np
-from tap_ros.errors import ConfigError
+from tap_ros.base.errors import ConfigError
 from tap_ros.images.crop import trained_crop
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.protocol import check_question, Predictor, Question

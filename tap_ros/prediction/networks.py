@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 import math
+from typing import Literal
 
-from tap_ros.errors import check_fields, ConfigError
+from tap_ros.base.errors import check_fields, ConfigError
 from tap_ros.images.crop import is_halved
-from tap_ros.prediction.methods import Decoder
 from tap_ros.prediction.warp import combine, warp
 import torch
 from torch import nn
@@ -48,7 +48,7 @@ class PredictorConfig:
     latent_size: int = 0
     new_pixels: bool = True
     flow_scale: float = 16.0
-    decoder: Decoder = 'separate'
+    decoder: Literal['separate', 'shared'] = 'separate'
     skips: bool = False
 
     def __post_init__(self) -> None:

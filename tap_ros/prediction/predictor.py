@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.base.errors import ConfigError, WeightsError
+from tap_ros.base.text import escaped
 from tap_ros.images.crop import trained_crop
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.protocol import check_question, Predictor, Question
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps, WarpedMaps
-from tap_ros.text import escaped
-from tap_ros.training.devices import placed
-from tap_ros.training.weights import load_weights, make_network
 from tap_ros.weights import find_predictor
+from tap_ros.weights.devices import placed
+from tap_ros.weights.weights import load_weights, make_network
 import torch
 
 

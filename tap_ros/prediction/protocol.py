@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, cast, Protocol
 
 import numpy as np
-from tap_ros.errors import ConfigError, ImageError, WeightsError
+from tap_ros.base.errors import ConfigError, ImageError, WeightsError
+from tap_ros.base.plugins import load_plugin, names
+from tap_ros.base.text import escaped
 from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image, check_pixels
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.plugins import load_plugin, names
-from tap_ros.text import escaped
 from tap_ros.weights import find_predictor, PREDICTORS
 
 GROUP = 'tap_ros.predictors'

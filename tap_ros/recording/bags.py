@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 import warnings
 
-from tap_ros.errors import ConfigError, ImageError, RecordingError
+from tap_ros.base.errors import ConfigError, ImageError, RecordingError
+from tap_ros.base.text import escaped
 from tap_ros.images.crop import CENTRE, check_trainable, TrainedCrop
 from tap_ros.recording.columns import Columns, first_size
 from tap_ros.recording.episode import RecordingWarning
@@ -18,7 +19,6 @@ from tap_ros.recording.foreign import open_file, recognise
 from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number, natural
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.topic_choice import find_topics, list_paths
-from tap_ros.text import escaped
 
 
 def find_bags(path: str | Path) -> list[list[Path]]:

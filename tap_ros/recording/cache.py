@@ -25,8 +25,8 @@ import tempfile
 import numpy as np
 from safetensors import safe_open, SafetensorError
 from safetensors.numpy import save_file
-from tap_ros.engines import run_tasks, Work
-from tap_ros.errors import EngineError, RecordingError
+from tap_ros.base.engines import run_tasks, Work
+from tap_ros.base.errors import EngineError, RecordingError
 from tap_ros.recording.align import assemble, runs_of
 from tap_ros.recording.bags import check_sizes, find_bags, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file, PICTURES

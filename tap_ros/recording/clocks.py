@@ -14,10 +14,10 @@ from dataclasses import replace
 import warnings
 
 import numpy as np
+from tap_ros.base.text import escaped
 from tap_ros.messages.stamps import PROOF
 from tap_ros.recording.columns import Track
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.text import escaped
 
 NOMINAL_NS = 10**8  # between frames of which neither stamps nor log times tell anything
 _APART_NS = 7 * 10**8  # late messages and slow cameras explain no larger difference of two clocks

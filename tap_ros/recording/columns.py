@@ -18,8 +18,9 @@ from typing import Any
 import zlib
 
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS
-from tap_ros.errors import ImageError, RecordingError
+from tap_ros.base.contract import GRIPPER_JOINTS
+from tap_ros.base.errors import ImageError, RecordingError
+from tap_ros.base.text import escaped
 from tap_ros.images.crop import CENTRE
 from tap_ros.messages.images import decode_image, decode_mask, is_empty
 from tap_ros.messages.joints import decode_positions, PLACE
@@ -33,7 +34,6 @@ from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import Mark
 from tap_ros.recording.views import first_return, look
 from tap_ros.robots.arm import find_joints, known_arms, MOST_JOINTS
-from tap_ros.text import escaped
 
 PICTURES = ('frame', 'mask', 'goal', 'goal_mask')
 WIDTHS = {'frame': 1, 'twist': 3, 'command': 1, 'joint': 4, 'arm': MOST_JOINTS,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import re
 
 import numpy as np
-from tap_ros.text import escaped
+from tap_ros.base.text import escaped
 
 FAR = 2**62  # ns; log times are held within +-FAR
 EXAMPLES = 3  # places named of one cause

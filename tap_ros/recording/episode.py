@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.errors import ImageError, RecordingError
+from tap_ros.base.errors import ImageError, RecordingError
 from tap_ros.images.pixels import check_mask
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ import re
 import shlex
 import stat
 
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.text import escaped
 from tap_ros.recording.trust import Budget
-from tap_ros.text import escaped
 import zstandard
 
 PACKED = '.zstd', '.zst'  # behind the name of a file that was compressed as a whole

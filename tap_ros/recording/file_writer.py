@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from mcap.writer import CompressionType, IndexType, Writer
-from tap_ros.errors import RecordingError
-from tap_ros.files import storage_errors
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.files import storage_errors
 from tap_ros.messages import topics
 from tap_ros.recording import metadata
 from tap_ros.recording.messages import schema_text, type_hash

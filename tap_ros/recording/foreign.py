@@ -14,13 +14,13 @@ import sqlite3
 
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC as MAGIC
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.text import escaped, listing
 from tap_ros.recording.damage import FAR, Loss
 from tap_ros.recording.file_bytes import bytes_of, PACKED, unpacked_name
 from tap_ros.recording.mcap_file import Channel, Found, McapFile
 from tap_ros.recording.metadata import bag_files, FILE_NAME, natural
 from tap_ros.recording.trust import Budget
-from tap_ros.text import escaped, listing
 import zstandard
 
 VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')

@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.files import write_atomically
+from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.files import write_atomically
+from tap_ros.base.text import escaped
 from tap_ros.recording.trust import parse_json, read_bytes
-from tap_ros.text import escaped
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore

@@ -28,12 +28,12 @@ from mcap.records import Chunk, ChunkIndex, DataEnd, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC as MAGIC
-from tap_ros.contract import MAX_PICTURE_BYTES
-from tap_ros.errors import RecordingError
+from tap_ros.base.contract import MAX_PICTURE_BYTES
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.text import escaped
 from tap_ros.recording.damage import FAR, Loss
 from tap_ros.recording.file_bytes import bytes_of, what_else
 from tap_ros.recording.trust import Budget
-from tap_ros.text import escaped
 import zstandard
 
 MAX_CHUNK_BYTES = 2**28  # a chunk that claims to unpack to more is refused

@@ -18,7 +18,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores, TypesysError
 from rosbags.typesys.store import Typestore
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
 import zstandard
 
 DEFINITIONS = {

@@ -14,12 +14,12 @@ from pathlib import Path
 import re
 from typing import Any
 
-from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.files import write_atomically
+from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.files import write_atomically
+from tap_ros.base.text import escaped, listing
 from tap_ros.recording.file_bytes import PACKED, unpacked_name
 from tap_ros.recording.trust import parse_json, read_bytes
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
-from tap_ros.text import escaped, listing
 import yaml
 
 FILE_NAME, MOUNT_NAME = 'metadata.yaml', 'arm_mount.json'

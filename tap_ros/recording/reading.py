@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Annotated, TYPE_CHECKING
 
-from tap_ros.errors import ConfigError
-from tap_ros.options import default_text
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.options import default_text
 from tyro import conf
 
 if TYPE_CHECKING:

@@ -17,8 +17,9 @@ from typing import Any
 import warnings
 
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS
-from tap_ros.errors import ImageError, RecordingError
+from tap_ros.base.contract import GRIPPER_JOINTS
+from tap_ros.base.errors import ImageError, RecordingError
+from tap_ros.base.text import escaped, listing
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import decode_positions, PLACE
 from tap_ros.messages.topics import BY_COLUMNS, IMAGE, JOINT_STATES, Topic, TOPICS
@@ -28,7 +29,6 @@ from tap_ros.recording.foreign import explain, open_file
 from tap_ros.recording.mcap_file import Channel
 from tap_ros.recording.messages import check_schema, decode
 from tap_ros.robots.arm import find_joints, known_arms
-from tap_ros.text import escaped, listing
 
 _LOOKED_AT = 5  # messages, as the first may be damaged
 _FEW = 20  # of a picture topic are so many times fewer than of a camera

@@ -15,8 +15,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tap_ros.errors import RecordingError
-from tap_ros.text import escaped
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.text import escaped
 
 MOST_FRAMES = 10**5  # of a demonstration
 MOST_BYTES = 2**32  # of its pictures, as they are kept

@@ -16,9 +16,10 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
-from tap_ros.errors import RecordingError
-from tap_ros.files import storage_errors
+from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.files import storage_errors
+from tap_ros.base.text import escaped
 from tap_ros.messages import topics
 from tap_ros.messages.images import camera_info_fields, image_fields, mask_fields
 from tap_ros.messages.joints import joint_fields
@@ -28,7 +29,6 @@ from tap_ros.recording import metadata
 from tap_ros.recording.episode import check_episode, Episode
 from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode, type_hash, typestore
-from tap_ros.text import escaped
 
 EPISODE_GAP_NS = 10**9  # between episodes whose stamps do not follow each other
 

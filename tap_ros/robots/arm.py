@@ -15,9 +15,9 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import ACTION_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW, WORLD_FRAME
-from tap_ros.errors import ConfigError, KinematicsError
-from tap_ros.plugins import load_plugin, names
+from tap_ros.base.contract import ACTION_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW, WORLD_FRAME
+from tap_ros.base.errors import ConfigError, KinematicsError
+from tap_ros.base.plugins import load_plugin, names
 
 DEFAULT_ARM = 'ur10e'
 MOST_JOINTS = 8  # of an arm

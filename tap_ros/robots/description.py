@@ -5,7 +5,7 @@
 from xml.etree import ElementTree
 
 import numpy as np
-from tap_ros.contract import WORLD_FRAME
+from tap_ros.base.contract import WORLD_FRAME
 from tap_ros.robots.arm import Arm, BASE_FRAME, DARK, Mount, TIP_FRAME
 
 

@@ -9,7 +9,7 @@ the arm lies in a vertical plane.
 """
 
 import numpy as np
-from tap_ros.errors import KinematicsError
+from tap_ros.base.errors import KinematicsError
 from tap_ros.robots.arm import along_z, Arm, Colour, DARK, Mount, Primitive, wrapped
 
 D1, D3, D5, A4, A7, FLANGE = 0.333, 0.316, 0.384, 0.0825, 0.088, 0.107  # m

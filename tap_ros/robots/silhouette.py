@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from tap_ros.contract import ROBOT_MASK_FREE
+from tap_ros.base.contract import ROBOT_MASK_FREE
 
 NEAR = 0.01  # m; what is nearer to the camera, or behind it, is cut off
 _LOW = 1e-3  # of a unit vector down; a light that falls more level throws shadows without end

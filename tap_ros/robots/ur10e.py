@@ -8,7 +8,7 @@ for this arm; the base frame is the controller's own ("base" of its URDF).
 """
 
 import numpy as np
-from tap_ros.errors import KinematicsError
+from tap_ros.base.errors import KinematicsError
 from tap_ros.robots.arm import along_z, Arm, Colour, DARK, Mount, Primitive, wrapped
 
 D1, A2, A3, D4, D5, D6 = 0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655  # m

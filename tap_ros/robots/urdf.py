@@ -16,8 +16,8 @@ from xml.etree import ElementTree
 
 import cv2
 import numpy as np
-from tap_ros.errors import ConfigError
-from tap_ros.text import escaped, listing
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.text import escaped, listing
 
 MOST_CHARACTERS = 2**21
 MOST_LINKS = 1000

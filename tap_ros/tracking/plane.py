@@ -9,7 +9,7 @@ the camera's size is.
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.errors import TrackingError
+from tap_ros.base.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
 
 SIDE = 256

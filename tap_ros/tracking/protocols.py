@@ -40,7 +40,7 @@ class Tracker(Protocol):
     Follows objects that are selected in a first picture.
 
     A class is made with a camera (robots.silhouette.PinholeCamera, its pose in the frame of the
-    table, whose top is z = 0) or None: without calibration. Names: tap_ros.plugins.
+    table, whose top is z = 0) or None: without calibration. Names: tap_ros.base.plugins.
     """
 
     def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray) -> Tracked:

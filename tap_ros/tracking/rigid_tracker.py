@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from tap_ros.errors import TrackingError
+from tap_ros.base.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane, TOP

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
-from tap_ros.errors import TrackingError
+from tap_ros.base.errors import TrackingError
 from tap_ros.tracking.picture import Palette, Picture, weighed
 from tap_ros.tracking.plane import Plane
 

@@ -14,11 +14,11 @@ import math
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from tap_ros.errors import ConfigError, WeightsError
-from tap_ros.text import escaped
-from tap_ros.training.devices import placed
+from tap_ros.base.errors import ConfigError, WeightsError
+from tap_ros.base.text import escaped
 from tap_ros.training.run_config import FREE
-from tap_ros.training.weights import load_tensors, save_tensors
+from tap_ros.weights.devices import placed
+from tap_ros.weights.weights import load_tensors, save_tensors
 import torch
 
 Trained = TypeVar('Trained', bound=torch.nn.Module)

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Union
 import warnings
 
 import numpy as np
-from tap_ros.errors import RecordingError
-from tap_ros.files import storage_errors
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.files import storage_errors
+from tap_ros.images.robot_mask import fill_in_time, hidden_pixels, last_free, RobotMask
 from tap_ros.messages.topics import ROBOT_MASK
 from tap_ros.recording.cache import cache_folder
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.training.frames import Frames, MappedFrames
-from tap_ros.training.robot_mask import fill_in_time, hidden_pixels, last_free, RobotMask
 from tqdm import tqdm
 
 if TYPE_CHECKING:

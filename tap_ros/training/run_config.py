@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import math
 from typing import Annotated
 
-from tap_ros.errors import check_fields, ConfigError
-from tap_ros.options import default_text, Folder
+from tap_ros.base.errors import check_fields, ConfigError
+from tap_ros.base.options import default_text, Folder
+from tap_ros.images.robot_mask import RobotMask
 from tap_ros.recording.reading import ReadingOptions
-from tap_ros.training.robot_mask import RobotMask
 from tap_ros.training.split import TEST_FRACTION
 from tyro import conf
 

@@ -9,7 +9,7 @@ import warnings
 import zlib
 
 import numpy as np
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
 from tap_ros.recording.episode import RecordingWarning
 
 if TYPE_CHECKING:

@@ -13,8 +13,9 @@ import cv2
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
-from tap_ros.errors import ConfigError, ImageError
-from tap_ros.evaluation import command
+from tap_ros.apps import evaluate as command
+from tap_ros.base.errors import ConfigError, ImageError
+from tap_ros.base.options import parse
 from tap_ros.evaluation.bottleneck import (
     bottleneck_scores,
     bottleneck_share,
@@ -24,13 +25,12 @@ from tap_ros.evaluation.keyframes import nearest_frame
 from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
-from tap_ros.options import parse
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.marks import Marks, write_marks
-from tap_ros.training.weights import save_weights
+from tap_ros.weights.weights import save_weights
 import torch
 
 SIZE = 32

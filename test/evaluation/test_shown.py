@@ -10,7 +10,7 @@ from sim_bridge.collect import make_episode
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import run_episode
 from tap_ros.evaluation.shown import ShownScorer
-from tap_ros.training.robot_mask import fill_in_time
+from tap_ros.images.robot_mask import fill_in_time
 
 CARRYING = 8  # a frame in which the hand is at the object
 

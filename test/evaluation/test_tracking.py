@@ -7,9 +7,9 @@ import json
 
 import numpy as np
 import pytest
-from tap_ros import plugins
-from tap_ros.errors import ConfigError, TrackingError
-from tap_ros.evaluation.tracking import summarise
+from tap_ros.apps.evaluate_tracking import summarise
+from tap_ros.base import plugins
+from tap_ros.base.errors import ConfigError, TrackingError
 from tap_ros.evaluation.tracks import fit_camera, follow, read_films, recoveries
 from tap_ros.recording.episode import Episode
 from tap_ros.robots.silhouette import PinholeCamera

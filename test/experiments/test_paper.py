@@ -17,9 +17,9 @@ from experiments.paper.sweep import find_result, Places
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
-from tap_ros.errors import ConfigError
-from tap_ros.options import parse
-from tap_ros.prediction.methods import method_fields
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.options import parse
+from tap_ros.training.methods import method_fields
 
 STORED = Path(__file__).parents[2] / 'docs' / 'results' / 'runs'
 SEEDS = (122, 142, *range(4), 6, 8)  # the first two are held out

@@ -10,14 +10,14 @@ from experiments.planning.methods import BASES, parse_method
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from tap_ros.errors import ConfigError
+from sim_bridge.true_model import TrueModel
+from tap_ros.base.errors import ConfigError
 from tap_ros.images.pixels import to_float
+from tap_ros.images.robot_mask import FreeView
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.protocols import SearchConfig
-from tap_ros.planning.true_model import TrueModel
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.training.robot_mask import FreeView
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
 SMALL = VisualMPCConfig(search=SearchConfig(16, 1, 4), proposals=8, batch_size=16, threads=1)

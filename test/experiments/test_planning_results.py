@@ -20,8 +20,8 @@ from experiments.planning.runs import (
     SPEED_ONLY,
 )
 import pytest
-from tap_ros.cli import main
-from tap_ros.errors import ConfigError
+from tap_ros.apps.cli import main
+from tap_ros.base.errors import ConfigError
 from tap_ros.planning.mpc_config import VisualMPCConfig, with_preset
 from tap_ros.planning.protocols import SearchConfig
 from tap_ros.weights import PREDICTORS

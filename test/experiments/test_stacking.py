@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.scene import HALF_HEIGHT
-from tap_ros.contract import SUCCESS_DISTANCE
+from tap_ros.base.contract import SUCCESS_DISTANCE
 from tap_ros.prediction.predictor import SubgoalPredictor
 
 FIRST_SCENE = FIRST_SCENES['stack3']

@@ -18,9 +18,9 @@ import time
 
 from experiments.paper.figures import COLOURS, INK, new_figure, to_png
 import pytest
-from tap_ros.errors import TapError
-from tap_ros.files import write_atomically, write_rows
-from tap_ros.text import escaped, listing
+from tap_ros.base.errors import TapError
+from tap_ros.base.files import write_atomically, write_rows
+from tap_ros.base.text import escaped, listing
 
 ROOT = Path(__file__).parents[2]
 MAX_REASONS = 4

@@ -10,11 +10,11 @@ import time
 from driven import Arm, goal_fields, MOVING_S, predict_fields, World
 from processes import Newest, NodeProcess, until
 from sensor_msgs.msg import JointState
-from tap_ros.errors import TapError
-from tap_ros.nodes.client import Client, PLANNER, READY
-from tap_ros.nodes.heartbeat import publishers_present
-from tap_ros.nodes.subscriptions import publishers_of
-from tap_ros.nodes.topics import STREAM
+from tap_ros.base.errors import TapError
+from tap_ros.ros.client import Client, PLANNER, READY
+from tap_ros.ros.heartbeat import publishers_present
+from tap_ros.ros.subscriptions import publishers_of
+from tap_ros.ros.topics import STREAM
 
 CALL_S = 20.0
 SIM_MODES = {'lock-step': {'lock_step': True}, 'real': {'lock_step': False}}

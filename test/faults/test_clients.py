@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectState, ObjectStates
-from tap_ros.errors import TapError
-from tap_ros.nodes.topics import SERVICE_QOS
+from tap_ros.base.errors import TapError
+from tap_ros.ros.topics import SERVICE_QOS
 
 pytestmark = pytest.mark.ros
 

@@ -14,11 +14,11 @@ from fault_report import fault
 from made_episodes import make_episode
 import numpy as np
 import pytest
-from tap_ros.errors import TapError
+from tap_ros.base.errors import TapError
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
-from tap_ros.training.weights import load_tensors, save_weights
+from tap_ros.weights.weights import load_tensors, save_weights
 
 TIMEOUT_S = 180.0
 FULL = 'the disk is full while recordings are collected or weights trained'

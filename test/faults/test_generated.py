@@ -15,15 +15,15 @@ from hypothesis import strategies as st
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile
-from tap_ros.contract import GRIPPER_JOINTS, MAP_ENCODING, MASK_ENCODING, NODE_CLASSES
-from tap_ros.errors import TapError
+from tap_ros.base.contract import GRIPPER_JOINTS, MAP_ENCODING, MASK_ENCODING, NODE_CLASSES
+from tap_ros.base.errors import TapError
 from tap_ros.images.encodings import ENCODINGS
-from tap_ros.nodes import heartbeat
-from tap_ros.nodes.calls import call, CallError
-from tap_ros.nodes.reaching import Reaching
-from tap_ros.nodes.topics import LATCHED
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.ur10e import UR10E
+from tap_ros.ros import heartbeat
+from tap_ros.ros.calls import call, CallError
+from tap_ros.ros.reaching import Reaching
+from tap_ros.ros.topics import LATCHED
 
 pytestmark = pytest.mark.ros
 

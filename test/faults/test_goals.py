@@ -18,8 +18,8 @@ import numpy as np
 from processes import NodeProcess, until
 import pytest
 from tap_msgs.action import ReachGoal
-from tap_ros.errors import TapError
-from tap_ros.nodes.reaching import Reaching
+from tap_ros.base.errors import TapError
+from tap_ros.ros.reaching import Reaching
 
 pytestmark = pytest.mark.ros
 

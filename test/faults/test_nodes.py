@@ -14,9 +14,9 @@ from processes import NodeProcess, until
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates
-from tap_ros.contract import NODE_CLASSES
-from tap_ros.errors import TapError
-from tap_ros.nodes.topics import STREAM, to_stamp
+from tap_ros.base.contract import NODE_CLASSES
+from tap_ros.base.errors import TapError
+from tap_ros.ros.topics import STREAM, to_stamp
 
 pytestmark = pytest.mark.ros
 

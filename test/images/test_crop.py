@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.errors import ImageError
+from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.base.errors import ImageError
 from tap_ros.images.crop import Crop, trained_crop, TrainedCrop
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from PIL import Image as Picture
 import pytest
-from tap_ros.errors import ImageError
+from tap_ros.base.errors import ImageError
 from tap_ros.images.encodings import decompress, find_encoding, to_rgb
 from tap_ros.messages.images import decode_image
 

@@ -20,17 +20,17 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage, Image, JointState
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.contract import GRIPPER_JOINTS, ROBOT_MASK_ARM, ROBOT_MASK_HAND
+from tap_ros.base.contract import GRIPPER_JOINTS, ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.images.crop import Crop, TrainedCrop
+from tap_ros.images.robot_mask import FreeView
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.predictor.requests import RequestReader
-from tap_ros.nodes.ros_messages import encode_image, encode_mask, encode_objects
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import BagWriter
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
-from tap_ros.training.robot_mask import FreeView
+from tap_ros.ros.ros_messages import encode_image, encode_mask, encode_objects
+from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
 
 pytestmark = pytest.mark.ros
 MS = 10**6

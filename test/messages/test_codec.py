@@ -10,12 +10,12 @@ import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.errors import ImageError, PlanningError
+from tap_ros.base.errors import ImageError, PlanningError
 from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.messages import images, objects
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
-from tap_ros.nodes import ros_messages
-from tap_ros.nodes.topics import to_stamp
+from tap_ros.ros import ros_messages
+from tap_ros.ros.topics import to_stamp
 
 pytestmark = pytest.mark.ros
 STAMP = Time(sec=3, nanosec=7)

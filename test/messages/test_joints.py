@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tap_ros.errors import KinematicsError
+from tap_ros.base.errors import KinematicsError
 from tap_ros.messages.joints import GripperHistory, JointHistory, positions_at
 from tap_ros.messages.stamps import MAX_GAP, stamp_fields
 from tap_ros.robots.arm import Mount

@@ -19,13 +19,13 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 import tap_ros
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.reaching import Reaching
-from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.planning.mpc_config import with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.ros.calls import CallError
+from tap_ros.ros.heartbeat import Liveness
+from tap_ros.ros.reaching import Reaching
+from tap_ros.ros.topics import LATCHED, STREAM
 from tap_ros.weights import FORWARD_MODEL
 import torch
 import yaml

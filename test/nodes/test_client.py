@@ -13,13 +13,13 @@ from processes import Client, until
 import pytest
 from std_msgs.msg import Bool
 import tap_ros
-from tap_ros.cli import main
-from tap_ros.errors import ConfigError
+from tap_ros.apps.cli import main
+from tap_ros.base.errors import ConfigError
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.predictor.node import OVERLAY_SCALE
-from tap_ros.nodes.topics import STREAM
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.ros.calls import CallError
+from tap_ros.ros.topics import STREAM
 from tap_ros.weights import DEFAULT_PREDICTOR
 
 pytestmark = pytest.mark.slow

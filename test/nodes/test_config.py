@@ -12,8 +12,8 @@ import sys
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
-from tap_ros.contract import CLIMB_LIMIT, MOVE_LIMIT, NODE_CLASSES
-from tap_ros.nodes.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
+from tap_ros.base.contract import CLIMB_LIMIT, MOVE_LIMIT, NODE_CLASSES
+from tap_ros.ros.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
 import yaml
 
 FILE = Path(__file__).parents[2] / 'config/tap_ros.yaml'
@@ -78,7 +78,7 @@ def test_what_the_user_has_chosen_is_kept():
 
 COMMAND = """
 import sys, time
-from tap_ros.nodes.node_processes import NodeProcesses
+from tap_ros.apps.node_processes import NodeProcesses
 with NodeProcesses(sys.argv[1]) as processes:
     processes.start('robot_mask_node')
     print(processes._processes['robot_mask_node'].pid, flush=True)

@@ -18,11 +18,8 @@ import pytest
 from rclpy.duration import Duration
 from std_msgs.msg import Header
 from tap_msgs.msg import ObjectStates
-from tap_ros.errors import TapError
-from tap_ros.messages.subgoals import Subgoal
-from tap_ros.nodes import client
-from tap_ros.nodes.demo import command
-from tap_ros.nodes.demo.film import (
+from tap_ros.apps.demo import command
+from tap_ros.apps.demo.film import (
     film,
     FRAME_MS,
     GAP,
@@ -34,11 +31,14 @@ from tap_ros.nodes.demo.film import (
     SIDE,
     START_MS,
 )
-from tap_ros.nodes.demo.lane import Lane
-from tap_ros.nodes.demo.report import gains, results_table, shown, summary, write_report
-from tap_ros.nodes.demo.watch import Watch
-from tap_ros.nodes.topics import STREAM
+from tap_ros.apps.demo.lane import Lane
+from tap_ros.apps.demo.report import gains, results_table, shown, summary, write_report
+from tap_ros.apps.demo.watch import Watch
+from tap_ros.base.errors import TapError
+from tap_ros.messages.subgoals import Subgoal
 from tap_ros.recording.cache import open_recordings
+from tap_ros.ros import client
+from tap_ros.ros.topics import STREAM
 
 LAYOUT = Path(__file__).parents[2] / 'config' / 'layouts' / 'tap_ros.json'
 SEED = 2_000_000

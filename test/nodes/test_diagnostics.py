@@ -11,12 +11,12 @@ from sensor_msgs.msg import CompressedImage, Image, JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from tap_msgs.msg import ObjectStates
-from tap_ros.nodes import diagnostics
-from tap_ros.nodes.calls import call
-from tap_ros.nodes.diagnostics import Diagnostics, Record
 from tap_ros.nodes.recorder.node import RecorderNode
-from tap_ros.nodes.subscriptions import why_silent
-from tap_ros.nodes.topics import STREAM
+from tap_ros.ros import diagnostics
+from tap_ros.ros.calls import call
+from tap_ros.ros.diagnostics import Diagnostics, Record
+from tap_ros.ros.subscriptions import why_silent
+from tap_ros.ros.topics import STREAM
 
 
 def test_what_is_published_instead_and_the_remedy_are_named():

@@ -15,8 +15,8 @@ from loop import SEED
 import numpy as np
 from processes import page_address, until
 import pytest
-from tap_ros.contract import SUCCESS_DISTANCE
-from tap_ros.nodes.topics import STREAM
+from tap_ros.base.contract import SUCCESS_DISTANCE
+from tap_ros.ros.topics import STREAM
 from websockets.sync.client import connect
 
 pytestmark = pytest.mark.slow

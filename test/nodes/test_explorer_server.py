@@ -14,15 +14,15 @@ from processes import Client, LocalNode, Newest, until
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
-from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
-from tap_ros.errors import ConfigError
-from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.explorer.browser_commands import CommandError, parse_command
-from tap_ros.nodes.explorer.display import GoalByHand
-from tap_ros.nodes.explorer.node import ExplorerNode
-from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
-from tap_ros.nodes.ros_messages import encode_image, encode_objects
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
+from tap_ros.apps.explorer.browser_commands import CommandError, parse_command
+from tap_ros.apps.explorer.display import GoalByHand
+from tap_ros.apps.explorer.node import ExplorerNode
+from tap_ros.apps.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
+from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
+from tap_ros.base.errors import ConfigError
+from tap_ros.ros.calls import CallError
+from tap_ros.ros.ros_messages import encode_image, encode_objects
+from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

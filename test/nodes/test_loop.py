@@ -12,7 +12,7 @@ import numpy as np
 from processes import LocalNode, until
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from tap_ros.errors import TapError
+from tap_ros.base.errors import TapError
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.predictor.node import PredictorNode

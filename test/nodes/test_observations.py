@@ -15,9 +15,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image, JointState
 from tap_msgs.msg import ObjectStates
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
-from tap_ros.nodes.ros_messages import encode_objects
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
+from tap_ros.ros.ros_messages import encode_objects
+from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
 
 
 def stamped(kind, nanoseconds):

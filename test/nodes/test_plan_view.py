@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from sim_bridge.world.looks import get_look
-from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.images.drawing import OBJECT_COLOURS
 from tap_ros.nodes.planner import plan_view
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel

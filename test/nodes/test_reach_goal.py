@@ -22,16 +22,16 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, String
 from tap_msgs.action import ReachGoal
 import tap_ros
+from tap_ros.apps.node_processes import NodeProcesses
 from tap_ros.messages.images import decode_image
-from tap_ros.nodes import reaching
-from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.planner.plan_view import CHOSEN
-from tap_ros.nodes.reaching import Reaching, watch_sender
-from tap_ros.nodes.topics import LATCHED, LOCK_STEP, STREAM
 from tap_ros.planning.mpc_config import PRESETS
-from tap_ros.training.weights import save_weights, stored_digest
+from tap_ros.ros import reaching
+from tap_ros.ros.calls import CallError
+from tap_ros.ros.reaching import Reaching, watch_sender
+from tap_ros.ros.topics import LATCHED, LOCK_STEP, STREAM
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
+from tap_ros.weights.weights import save_weights, stored_digest
 
 pytestmark = pytest.mark.slow
 CLIENT = """

@@ -14,14 +14,14 @@ from rclpy.qos import qos_profile_sensor_data, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
-from tap_ros.nodes.calls import call
 from tap_ros.nodes.recorder.node import RecorderNode
-from tap_ros.nodes.ros_messages import encode_image
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.messages import decode
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.robots.arm import Mount
 from tap_ros.robots.ur10e import UR10E
+from tap_ros.ros.calls import call
+from tap_ros.ros.ros_messages import encode_image
+from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
 
 
 def read(folder):

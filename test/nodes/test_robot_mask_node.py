@@ -10,15 +10,15 @@ from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
-from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.errors import ImageError, TapError
+from tap_ros.base.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.base.errors import ImageError, TapError
 from tap_ros.messages.images import decode_camera_info, decode_mask
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.robot_mask.node import RobotMaskNode
-from tap_ros.nodes.robot_view import RobotView
-from tap_ros.nodes.ros_messages import encode_camera_info, encode_image
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.robots.ur10e import UR10E
+from tap_ros.ros.robot_view import RobotView
+from tap_ros.ros.ros_messages import encode_camera_info, encode_image
+from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
 
 CAMERA = {  # of the simulator with its arm: 0.84 rad from straight down
     'camera_y': -1.36, 'camera_z': 1.33,

@@ -8,8 +8,8 @@ from processes import LocalNode, until
 from rclpy.node import Node
 from std_srvs.srv import SetBool
 import tap_ros
-from tap_ros.nodes.services import DeferredService
-from tap_ros.nodes.topics import SERVICE_QOS
+from tap_ros.ros.services import DeferredService
+from tap_ros.ros.topics import SERVICE_QOS
 
 
 class Deferring(Node):

@@ -20,8 +20,8 @@ from tap_msgs.srv import StepScene
 import tap_ros
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.calls import CallError
+from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
 
 PERIOD_NS = 250_000_000
 

@@ -15,16 +15,16 @@ import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates
 import tap_ros
-from tap_ros.contract import CONTROL_PERIOD
-from tap_ros.errors import TapError
+from tap_ros.apps.explorer.node import ExplorerNode
+from tap_ros.base.contract import CONTROL_PERIOD
+from tap_ros.base.errors import TapError
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.client import positions_of
-from tap_ros.nodes.explorer.node import ExplorerNode
-from tap_ros.nodes.ros_messages import encode_camera_info, encode_image, encode_joints
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.nodes.tracker.node import TrackerNode
+from tap_ros.ros.calls import CallError
+from tap_ros.ros.client import positions_of
+from tap_ros.ros.ros_messages import encode_camera_info, encode_image, encode_joints
+from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
 from websockets.sync.client import connect
 
 SIZE = 128

@@ -35,7 +35,7 @@ def test_the_environment_can_be_entered_by_any_shell(options):
 def test_without_opengl_physics_runs_and_pictures_are_refused_in_one_line(value='disabled'):
     done = run('import sim_bridge, mujoco\n'
                'mujoco.MjModel.from_xml_string("<mujoco/>")\n'
-               'from tap_ros.errors import SceneError\n'
+               'from tap_ros.base.errors import SceneError\n'
                'try: from sim_bridge.simulator import Simulator; Simulator().reset(0)\n'
                'except SceneError as error: print("refused:", error)', MUJOCO_GL=value)
     assert done.returncode == 0 and done.stdout.startswith('refused: '), done.stdout

@@ -13,7 +13,7 @@ from ament_index_python import get_package_prefix, get_package_share_directory
 from catkin_pkg.package import parse_package
 from packaging.requirements import Requirement
 import setuptools.build_meta  # noqa: F401  setup.py sees that it is pip who asks
-from tap_ros.contract import NODE_CLASSES
+from tap_ros.base.contract import NODE_CLASSES
 from tap_ros.messages.topics import TOPICS
 
 ROOT = Path(__file__).parents[2]

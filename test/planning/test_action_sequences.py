@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from tap_ros.contract import LIFTED, LOW
+from tap_ros.base.contract import LIFTED, LOW
 from tap_ros.planning.action_sequences import (
     landings,
     Limits,

@@ -8,22 +8,22 @@ from made_episodes import cover, write_bag
 import numpy as np
 import pytest
 from safetensors.torch import load_file
-from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.planning.forward_loss import (
+from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.images.robot_mask import fill_from_past
+from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
+from tap_ros.planning.table import project
+from tap_ros.recording.cache import open_recordings
+from tap_ros.training.forward import model_config, train
+from tap_ros.training.forward_config import ForwardTrainingConfig
+from tap_ros.training.forward_loss import (
     Cuts,
     forward_loss,
     make_windows,
     OBJECT_WEIGHT,
     STILL_WEIGHT,
 )
-from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
-from tap_ros.planning.forward_training import model_config, train
-from tap_ros.planning.forward_training_config import ForwardTrainingConfig
-from tap_ros.planning.table import project
-from tap_ros.recording.cache import open_recordings
 from tap_ros.training.inpainted import FilledStore
-from tap_ros.training.robot_mask import fill_from_past
-from tap_ros.training.weights import save_weights
+from tap_ros.weights.weights import save_weights
 import torch
 from toy_world import ARM, make_episode, SIZE, TABLE, to_pixels
 
@@ -72,7 +72,7 @@ def test_the_loss_is_that_of_the_chosen_pictures_and_what_moves_costs_a_little(
     with torch.no_grad():
         model.push.masks.bias.copy_(torch.tensor([0, 0, 50.0]))  # says that all stays
     assert forward_loss(model, batch, {1})[1]['moving'] == pytest.approx(0, abs=1e-6)
-    monkeypatch.setattr('tap_ros.planning.forward_loss.MOTION_FACTOR', 0.0)
+    monkeypatch.setattr('tap_ros.training.forward_loss.MOTION_FACTOR', 0.0)
     assert forward_loss(model, batch, {4})[1]['picture'] < last['picture']
 
 

@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 import numpy as np
-from tap_ros.contract import LIFTED, LOW
+from tap_ros.base.contract import LIFTED, LOW
 from tap_ros.planning.action_sequences import FULL, HORIZON
 from tap_ros.planning.cost import (
     distances_to_all_pixels,

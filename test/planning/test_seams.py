@@ -9,8 +9,9 @@ import time
 import numpy as np
 import pytest
 import tap_ros
-from tap_ros import plugins, VisualMPC
-from tap_ros.errors import ConfigError
+from tap_ros import VisualMPC
+from tap_ros.base import plugins
+from tap_ros.base.errors import ConfigError
 from tap_ros.planning.cost import PlanCost
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig

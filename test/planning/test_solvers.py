@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tap_ros.base.plugins import load_plugin, names
+from tap_ros.base.search import cross_entropy
 from tap_ros.planning.protocols import Problem, SearchConfig
 from tap_ros.planning.solvers.icem import icem
-from tap_ros.plugins import load_plugin, names
-from tap_ros.search import cross_entropy
 
 TARGET = np.array([0.3, -0.7, 0.2])
 solvers = pytest.mark.parametrize('solver', [

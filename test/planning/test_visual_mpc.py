@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tap_ros.errors import ImageError, PlanningError
+from tap_ros.base.errors import ImageError, PlanningError
 from tap_ros.planning.action_sequences import FULL
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig

@@ -7,13 +7,13 @@ from dataclasses import replace
 from lively import lively_network
 import numpy as np
 import pytest
-from tap_ros.errors import ConfigError, ImageError, WeightsError
+from tap_ros.base.errors import ConfigError, ImageError, WeightsError
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.protocol import Question
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
-from tap_ros.training.weights import save_weights
+from tap_ros.weights.weights import save_weights
 import torch
 
 CONFIG = PredictorConfig(image_size=32, base_width=4, new_pixels=False)

@@ -10,7 +10,7 @@ import sys
 from made_episodes import assert_all_equal, make_episode
 import numpy as np
 import pytest
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
 from tap_ros.recording import cache as cache_module
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.writer import EpisodeWriter

@@ -12,7 +12,7 @@ from made_episodes import make_episode
 import numpy as np
 from PIL import Image as Picture
 import pytest
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
 from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.recording.bags import list_topics, reading_like
 from tap_ros.recording.cache import open_recordings

@@ -13,7 +13,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 import pytest
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
 from tap_ros.recording import mcap_file
 from tap_ros.recording import writer as writer_module
 from tap_ros.recording.cache import open_recordings

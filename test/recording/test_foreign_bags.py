@@ -18,7 +18,7 @@ from made_bags import (
 )
 import numpy as np
 import pytest
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.topic_choice import find_topics

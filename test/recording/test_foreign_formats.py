@@ -16,8 +16,8 @@ from made_bags import camera, joints, record, SECOND, write_mcap
 import numpy as np
 import pytest
 from rosbags.rosbag2 import Writer as Ros2Writer
-from tap_ros.cli import main, read
-from tap_ros.errors import RecordingError
+from tap_ros.apps.cli import main, read
+from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import typestore
 import zstandard

@@ -23,8 +23,8 @@ import numpy as np
 import pyarrow
 from pyarrow import parquet
 import pytest
-from tap_ros.cli import main
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.apps.cli import main
+from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.recording import mcap_file
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks

@@ -11,7 +11,7 @@ import cv2
 import google_crc32c
 import numpy as np
 import pytest
-from tap_ros.cli import main
+from tap_ros.apps.cli import main
 from tap_ros.recording.cache import open_recordings
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
 from tap_ros.messages import topics
 from tap_ros.recording.messages import (
     check_schema,

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from tap_ros.errors import RecordingError
+from tap_ros.base.errors import RecordingError
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 import yaml
 

@@ -8,9 +8,9 @@ from itertools import product
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from tap_ros import plugins
-from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM
-from tap_ros.errors import ConfigError, KinematicsError
+from tap_ros.base import plugins
+from tap_ros.base.contract import CONTROL_PERIOD, ROBOT_MASK_ARM
+from tap_ros.base.errors import ConfigError, KinematicsError
 from tap_ros.robots.arm import find_joints, get_arm, known_arms, TIP_FRAME
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.ur10e import UR10E
@@ -66,7 +66,7 @@ def test_urdf_transforms_and_kinematics_agree(arm):
 def test_another_package_adds_an_arm_in_a_few_lines(monkeypatch):
     taller = replace(UR10E, name='taller', mount=replace(UR10E.mount, position=(0.0, 0.7, 0.1)))
     monkeypatch.setattr(plugins, 'taller', taller, raising=False)
-    monkeypatch.setitem(plugins.BUILT_IN['tap_ros.arms'], 'taller', 'tap_ros.plugins:taller')
+    monkeypatch.setitem(plugins.BUILT_IN['tap_ros.arms'], 'taller', 'tap_ros.base.plugins:taller')
     masks = []
     for name in ('panda', 'taller', 'ur10e'):
         simulator = Simulator('push2', 64, 'arm', arm=name)

@@ -5,7 +5,7 @@
 import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.studio import Studio
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
 from tap_ros.robots.ur10e import UR10E

@@ -5,7 +5,7 @@
 import mujoco
 import numpy as np
 import pytest
-from tap_ros.errors import ConfigError
+from tap_ros.base.errors import ConfigError
 from tap_ros.robots.urdf import read_urdf
 
 ARM = """<robot name="r">

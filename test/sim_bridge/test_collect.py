@@ -14,10 +14,10 @@ import pytest
 from sim_bridge.collect import collect, CollectConfig, make_episode
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode
-from tap_ros.engines import Engine
-from tap_ros.errors import ConfigError, StorageError, TapError
+from tap_ros.base.engines import Engine
+from tap_ros.base.errors import ConfigError, StorageError, TapError
+from tap_ros.base.files import only_writer
 from tap_ros.evaluation.bottleneck import bottleneck_share
-from tap_ros.files import only_writer
 from tap_ros.recording.cache import open_recordings
 
 SMALL = CollectConfig(episodes=3, episodes_per_file=1, seed=5, frames=12)

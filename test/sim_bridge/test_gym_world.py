@@ -13,8 +13,8 @@ from sim_bridge.gym_pushes import record_pushes
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from sim_bridge.world_protocol import make_world
-from tap_ros.engines import Engine
-from tap_ros.errors import SceneError, TapError
+from tap_ros.base.engines import Engine
+from tap_ros.base.errors import SceneError, TapError
 from tap_ros.recording.cache import open_recordings
 
 

@@ -13,8 +13,8 @@ from sim_bridge.tasks.push import GOAL_DISTANCE, nearest_first
 from sim_bridge.tasks.stack import HAND_MARGIN
 from sim_bridge.tasks.tasks import get_task, sample_scene, task_names
 from sim_bridge.world.table import GRIPPER_MARGIN
-from tap_ros.contract import WORKSPACE_HIGH
-from tap_ros.errors import SceneError
+from tap_ros.base.contract import WORKSPACE_HIGH
+from tap_ros.base.errors import SceneError
 
 TASKS = [get_task(name) for name in task_names()]
 

@@ -11,8 +11,8 @@ import pytest
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.looks import LOOKS
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.errors import KinematicsError
+from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.base.errors import KinematicsError
 from tap_ros.robots.ur10e import UR10E
 
 TASKS = ('push2', 'pick_place')

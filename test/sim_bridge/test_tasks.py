@@ -20,8 +20,8 @@ from sim_bridge.tasks.tasks import (
     TaskScene,
 )
 from sim_bridge.world.scene import random_shape
-from tap_ros import plugins
-from tap_ros.contract import SUCCESS_DISTANCE
+from tap_ros.base import plugins
+from tap_ros.base.contract import SUCCESS_DISTANCE
 from tap_ros.recording.cache import open_recordings
 
 NUM_FRAMES = {'grasp': 15, 'pick_place': 20}
@@ -132,7 +132,7 @@ class Visit(Task):
 
 def test_another_package_adds_a_task_in_a_few_lines(tmp_path, monkeypatch):
     monkeypatch.setattr(plugins, 'visit', Visit('visit', 1, 10, stream=99), raising=False)
-    monkeypatch.setitem(plugins.BUILT_IN['tap_ros.tasks'], 'visit', 'tap_ros.plugins:visit')
+    monkeypatch.setitem(plugins.BUILT_IN['tap_ros.tasks'], 'visit', 'tap_ros.base.plugins:visit')
     assert 'visit' in task_names()
     simulator = Simulator('visit')
     simulator.reset(0)

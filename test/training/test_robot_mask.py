@@ -7,18 +7,18 @@ import dataclasses
 from made_episodes import cover, make_episode, write_bag
 import numpy as np
 import pytest
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.errors import RecordingError
-from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import RecordingWarning
-from tap_ros.training.frames import GOAL, MappedFrames, ResidentFrames
-from tap_ros.training.inpainted import fill, FilledStore, with_masks
-from tap_ros.training.robot_mask import (
+from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.base.errors import RecordingError
+from tap_ros.images.robot_mask import (
     fill_from_past,
     fill_in_time,
     FreeView,
     hidden_pixels,
 )
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.episode import RecordingWarning
+from tap_ros.training.frames import GOAL, MappedFrames, ResidentFrames
+from tap_ros.training.inpainted import fill, FilledStore, with_masks
 
 
 @pytest.fixture(autouse=True)

@@ -10,13 +10,13 @@ import shutil
 import signal
 
 import pytest
-from tap_ros.cli import main
-from tap_ros.errors import ConfigError, StorageError, WeightsError
-from tap_ros.files import only_writer
-from tap_ros.prediction.training import train
-from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.apps.cli import main
+from tap_ros.base.errors import ConfigError, StorageError, WeightsError
+from tap_ros.base.files import only_writer
 from tap_ros.training.checkpoints import start, TrainingState, WARMUP
-from tap_ros.training.weights import load_tensors, save_tensors
+from tap_ros.training.predictor import train
+from tap_ros.training.predictor_config import TrainingConfig
+from tap_ros.weights.weights import load_tensors, save_tensors
 import torch
 
 SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
@@ -123,7 +123,7 @@ def test_a_run_of_other_settings_or_of_another_process_is_not_continued(half):
 
 def test_patience_keeps_the_best_weights_and_ends_when_none_better_come(tmp_path, monkeypatch):
     scores = {1: 3.0, 2: 1.0, 3: 2.0, 4: 2.0, 5: 0.5}
-    monkeypatch.setattr('tap_ros.prediction.training._score', lambda run, *_: (
+    monkeypatch.setattr('tap_ros.training.predictor._score', lambda run, *_: (
         {'relative': scores.get(run.state.step, 1.0)}, {}))
     patient = replace(CONFIG, patience=2, steps=9, save_every=1)
     held = {}

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 from made_episodes import make_episode, write_bag
 import numpy as np
 import pytest
-from tap_ros.errors import RecordingError
-from tap_ros.planning.forward_training_config import ForwardTrainingConfig
+from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.forward_config import ForwardTrainingConfig
 from tap_ros.training.run import paths_of
 from tap_ros.training.split import split_episodes
 

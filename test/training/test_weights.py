@@ -7,18 +7,18 @@ import json
 import numpy as np
 import pytest
 from safetensors.torch import save_file
-from tap_ros.errors import WeightsError
+from tap_ros.base.errors import WeightsError
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.predictor import load_network
-from tap_ros.training.weights import (
+from tap_ros.weights import FORWARD_MODEL
+from tap_ros.weights.weights import (
     load_tensors,
     load_weights,
     make_network,
     save_tensors,
     save_weights,
 )
-from tap_ros.weights import FORWARD_MODEL
 import torch
 
 CONFIG = PredictorConfig(base_width=4, image_size=16, new_pixels=False)

@@ -27,13 +27,13 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.nodes.calls import call, CallError
-from tap_ros.nodes.client import Client, request_fields
-from tap_ros.nodes.node_processes import NodeProcesses
+from tap_ros.apps.node_processes import NodeProcesses
 from tap_ros.nodes.predictor.requests import MAX_TOGETHER as TOGETHER
-from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.protocol import Question
+from tap_ros.ros.calls import call, CallError
+from tap_ros.ros.client import Client, request_fields
+from tap_ros.ros.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights import DEFAULT_PREDICTOR
 
 PIXELS = np.array([[[20, 21], [40, 33]], [[30, 12], [44, 50]]], np.float32)  # start, goal

@@ -13,11 +13,11 @@ import numpy as np
 from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import Float64
-from tap_ros.errors import PlanningError
-from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.text import escaped
+from tap_ros.base.errors import PlanningError
+from tap_ros.base.text import escaped
+from tap_ros.ros.observations import Observations
+from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.topics import LATCHED, STREAM
 
 WATCH_S = 0.02  # s between two checks whether the arm has to be stopped
 STOOD_S = 2.0  # s; a longer gap between checks proves that the process or machine stood still

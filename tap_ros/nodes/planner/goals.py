@@ -8,16 +8,16 @@ import numpy as np
 from rclpy.node import Node
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
-from tap_ros.errors import PlanningError
+from tap_ros.base.errors import PlanningError
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
-from tap_ros.nodes.client import Client
-from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
-from tap_ros.nodes.robot_view import RobotView
-from tap_ros.nodes.ros_messages import encode_image, encode_objects
-from tap_ros.nodes.topics import goal_topics, LATCHED, to_stamp
 from tap_ros.planning.reach import Seen
+from tap_ros.ros.client import Client
+from tap_ros.ros.observations import Observations
+from tap_ros.ros.robot_view import RobotView
+from tap_ros.ros.ros_messages import encode_image, encode_objects
+from tap_ros.ros.topics import goal_topics, LATCHED, to_stamp
 
 
 class GoalSource:

@@ -19,33 +19,33 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused
-from tap_ros.errors import ConfigError, PlanningError, TapError
+from tap_ros.base.errors import ConfigError, PlanningError, TapError
+from tap_ros.base.text import escaped, listing
 from tap_ros.messages.objects import check_found, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES, TWIST
-from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.client import Client
-from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.planner import settings
 from tap_ros.nodes.planner.arm import ArmCommander
 from tap_ros.nodes.planner.goals import ask_subgoals, GoalSource
 from tap_ros.nodes.planner.plan_view import draw_plan
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import declare_parameters
-from tap_ros.nodes.reaching import watch_sender
-from tap_ros.nodes.robot_view import warn_if_unlike
-from tap_ros.nodes.ros_messages import encode_image
-from tap_ros.nodes.services import reason
-from tap_ros.nodes.subscriptions import publishers_beside, steady_timer
-from tap_ros.nodes.topics import camera_topics, goal_topics, STREAM, to_stamp
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, Command, End, Reach, Seen
 from tap_ros.planning.visual_mpc import VisualMPC
-from tap_ros.text import escaped, listing
+from tap_ros.ros.calls import CallError
+from tap_ros.ros.client import Client
+from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.lifecycle import LifecycleBase
+from tap_ros.ros.reaching import watch_sender
+from tap_ros.ros.robot_view import warn_if_unlike
+from tap_ros.ros.ros_messages import encode_image
+from tap_ros.ros.services import reason
+from tap_ros.ros.subscriptions import publishers_beside, steady_timer
+from tap_ros.ros.topics import camera_topics, goal_topics, STREAM, to_stamp
 
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'

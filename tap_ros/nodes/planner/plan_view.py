@@ -4,7 +4,7 @@
 
 import cv2
 import numpy as np
-from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.images.drawing import draw_crosses, enlarge
 from tap_ros.planning.forward_model import ForwardModelConfig
 from tap_ros.planning.table import project

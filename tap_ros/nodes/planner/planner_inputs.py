@@ -14,7 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from tap_msgs.msg import Episode, ObjectStates
-from tap_ros.errors import ImageError, KinematicsError, PlanningError, TapError
+from tap_ros.base.errors import ImageError, KinematicsError, PlanningError, TapError
 from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image
 from tap_ros.messages.images import decode_image
@@ -22,12 +22,12 @@ from tap_ros.messages.joints import GripperHistory
 from tap_ros.messages.objects import decode_cut_objects, decode_states
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
-from tap_ros.nodes.observations import JUMP_NS, Observations, reception_time
-from tap_ros.nodes.parameters import declared_arm, Parameters
-from tap_ros.nodes.robot_view import RobotView
-from tap_ros.nodes.subscriptions import publishers_of, rivals
-from tap_ros.nodes.topics import camera_topics, LATCHED, LOCK_STEP, of_topic, STREAM
 from tap_ros.planning.reach import Seen
+from tap_ros.ros.observations import JUMP_NS, Observations, reception_time
+from tap_ros.ros.parameters import declared_arm, Parameters
+from tap_ros.ros.robot_view import RobotView
+from tap_ros.ros.subscriptions import publishers_of, rivals
+from tap_ros.ros.topics import camera_topics, LATCHED, LOCK_STEP, of_topic, STREAM
 
 
 class PlannerInputs:

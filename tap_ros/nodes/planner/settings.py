@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from rclpy.node import Node
 from tap_msgs.action import ReachGoal
-from tap_ros.contract import (
+from tap_ros.base.contract import (
     CLIMB_LIMIT,
     CONTROL_PERIOD,
     GOAL_TOLERANCE,
@@ -15,15 +15,15 @@ from tap_ros.contract import (
     step_budget,
     WORLD_FRAME,
 )
-from tap_ros.errors import ConfigError, TapError
-from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.base.errors import ConfigError, TapError
+from tap_ros.base.plugins import names
+from tap_ros.base.text import escaped
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import ReachConfig
 from tap_ros.planning.visual_mpc import VisualMPC
-from tap_ros.plugins import names
-from tap_ros.text import escaped
+from tap_ros.ros.parameters import check_device, Parameters
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
 MODES = ('subgoal', 'direct')

@@ -13,21 +13,21 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.errors import ConfigError, TapError
+from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.images.drawing import overlay
+from tap_ros.images.robot_mask import trained_robot_mask
 from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
-from tap_ros.nodes import services
-from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.lifecycle import LifecycleBase
-from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.predictor import requests
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
-from tap_ros.nodes.robot_view import warn_if_unlike
-from tap_ros.nodes.ros_messages import encode_image
-from tap_ros.nodes.subscriptions import steady_timer
-from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
-from tap_ros.training.robot_mask import trained_robot_mask
+from tap_ros.ros import services
+from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.lifecycle import LifecycleBase
+from tap_ros.ros.parameters import check_device, Parameters
+from tap_ros.ros.robot_view import warn_if_unlike
+from tap_ros.ros.ros_messages import encode_image
+from tap_ros.ros.subscriptions import steady_timer
+from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took

@@ -9,7 +9,7 @@ import threading
 import traceback
 from typing import Generic, TypeVar
 
-from tap_ros.errors import TapError
+from tap_ros.base.errors import TapError
 
 Request = TypeVar('Request')
 Answer = TypeVar('Answer')

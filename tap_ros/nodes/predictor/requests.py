@@ -14,23 +14,23 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.contract import CAMERA_FRAME
-from tap_ros.errors import ConfigError, ImageError, TapError
+from tap_ros.base.contract import CAMERA_FRAME
+from tap_ros.base.errors import ConfigError, ImageError, TapError
+from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.objects import check_found, decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.robot_view import RobotView
-from tap_ros.nodes.ros_messages import encode_subgoal
-from tap_ros.nodes.subscriptions import rivals
-from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, STREAM
-from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.protocol import Predictor, Question
-from tap_ros.text import escaped, listing
+from tap_ros.ros.observations import Observations
+from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.robot_view import RobotView
+from tap_ros.ros.ros_messages import encode_subgoal
+from tap_ros.ros.subscriptions import rivals
+from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, STREAM
+from tap_ros.training.methods import MODES
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8

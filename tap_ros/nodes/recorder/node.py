@@ -11,18 +11,18 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
-from tap_ros.errors import ConfigError, RecordingError, StorageError
-from tap_ros.files import free_folder
+from tap_ros.base.errors import ConfigError, RecordingError, StorageError
+from tap_ros.base.files import free_folder
+from tap_ros.base.text import escaped
 from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
-from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.parameters import declared_mount, Parameters
-from tap_ros.nodes.ros_messages import message_class
-from tap_ros.nodes.services import answering
-from tap_ros.nodes.subscriptions import AdaptiveSubscription, steady_timer
-from tap_ros.nodes.topics import camera_image, SERVICE_QOS
 from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.recording.writer import BagWriter
-from tap_ros.text import escaped
+from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.parameters import declared_mount, Parameters
+from tap_ros.ros.ros_messages import message_class
+from tap_ros.ros.services import answering
+from tap_ros.ros.subscriptions import AdaptiveSubscription, steady_timer
+from tap_ros.ros.topics import camera_image, SERVICE_QOS
 
 DEPTH = 100  # messages that may wait while the disk is slow
 TRANSIENT_LOCAL = DurabilityPolicy.TRANSIENT_LOCAL

@@ -11,29 +11,29 @@ import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
-from tap_ros.errors import ConfigError, ImageError, KinematicsError, TapError
+from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
+from tap_ros.base.errors import ConfigError, ImageError, KinematicsError, TapError
+from tap_ros.base.plugins import names
+from tap_ros.base.text import escaped
 from tap_ros.messages.images import decode_camera_info
 from tap_ros.messages.joints import JointHistory
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.observations import reception_time
-from tap_ros.nodes.parameters import declared_mount, Parameters
-from tap_ros.nodes.ros_messages import encode_mask
-from tap_ros.nodes.services import log_error
-from tap_ros.nodes.subscriptions import (
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
+from tap_ros.robots.description import robot_description
+from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
+from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
+from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.observations import reception_time
+from tap_ros.ros.parameters import declared_mount, Parameters
+from tap_ros.ros.ros_messages import encode_mask
+from tap_ros.ros.services import log_error
+from tap_ros.ros.subscriptions import (
     adapt_regularly,
     AdaptiveSubscription,
     rivals,
     steady_timer,
 )
-from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.plugins import names
-from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
-from tap_ros.robots.description import robot_description
-from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
-from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
-from tap_ros.text import escaped
+from tap_ros.ros.topics import LATCHED, STREAM
 
 WAITING = 100  # pictures that may wait for their joint states
 

@@ -16,32 +16,32 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import Episode, ObjectStates
 from tap_msgs.srv import SelectObjects
-from tap_ros.contract import WORLD_FRAME
-from tap_ros.errors import ImageError, KinematicsError, TapError, TrackingError
+from tap_ros.base.contract import WORLD_FRAME
+from tap_ros.base.errors import ImageError, KinematicsError, TapError, TrackingError
+from tap_ros.base.plugins import load_plugin, names
+from tap_ros.base.text import escaped, listing
+from tap_ros.images.robot_mask import hidden_pixels
 from tap_ros.messages.images import decode_camera_info, decode_image, decode_mask, is_empty
 from tap_ros.messages.joints import GripperHistory
 from tap_ros.messages.objects import decode_objects, MAX_OBJECTS
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE, JOINT_STATES
-from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
-from tap_ros.nodes.parameters import declared_arm, Parameters, pose_matrix
-from tap_ros.nodes.ros_messages import encode_objects
-from tap_ros.nodes.services import answering, log_error
-from tap_ros.nodes.subscriptions import (
+from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.observations import JUMP_NS, Moment, Observations, reception_time
+from tap_ros.ros.parameters import declared_arm, Parameters, pose_matrix
+from tap_ros.ros.ros_messages import encode_objects
+from tap_ros.ros.services import answering, log_error
+from tap_ros.ros.subscriptions import (
     adapt_regularly,
     AdaptiveSubscription,
     publishers_of,
     rivals,
 )
-from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, SERVICE_QOS, STREAM
-from tap_ros.plugins import load_plugin, names
-from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.text import escaped, listing
+from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, SERVICE_QOS, STREAM
 from tap_ros.tracking.plane import check_pose, MIDDLE, Plane
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, Tracker, View
 from tap_ros.tracking.registration import propose
-from tap_ros.training.robot_mask import hidden_pixels
 
 MOVED = 2.0  # px of the working picture by which the table has moved in that of another camera
 

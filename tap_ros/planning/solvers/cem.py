@@ -3,8 +3,8 @@
 """The cross-entropy method as a solver of the planner (App. F of the paper)."""
 
 import numpy as np
+from tap_ros.base.search import cross_entropy, finite
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
-from tap_ros.search import cross_entropy, finite
 
 
 def cem(problem: Problem, config: SearchConfig, rng: np.random.Generator) -> Solution:

@@ -10,9 +10,9 @@ judges the mean.
 """
 
 import numpy as np
+from tap_ros.base.search import cross_entropy
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
 from tap_ros.planning.solvers.cem import judged_once_more
-from tap_ros.search import cross_entropy
 
 BETA = 2.0  # exponent of the noise's power spectrum, 1 / f^BETA; 0 is white
 KEPT = 0.3  # share of the elites that stay

@@ -23,8 +23,9 @@ import re
 from typing import Any
 
 import numpy as np
-from tap_ros.contract import MAX_PICTURE_BYTES
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.base.contract import MAX_PICTURE_BYTES
+from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.text import escaped, listing
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.file_bytes import what_else
@@ -39,7 +40,6 @@ from tap_ros.recording.formats.pictures import (
 )
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.trust import Budget, MOST_BYTES, MOST_FRAMES
-from tap_ros.text import escaped, listing
 
 FPS = 10.0  # where nobody says another
 _KEPT = 2**20  # bytes of chunks that HDF5 keeps unpacked

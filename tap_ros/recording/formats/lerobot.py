@@ -21,8 +21,9 @@ from typing import Annotated, Any
 import warnings
 
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS, MAX_PICTURE_BYTES
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.base.contract import GRIPPER_JOINTS, MAX_PICTURE_BYTES
+from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.cache import open_recordings
@@ -41,7 +42,6 @@ from tap_ros.recording.formats.pictures import (
 from tap_ros.recording.marks import beside, write_marks
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.trust import Budget, inside, parse_json, read_bytes
-from tap_ros.text import escaped, listing
 from tyro import conf
 
 INFO = 'meta/info.json'

@@ -16,10 +16,11 @@ import shutil
 from typing import Any
 
 import numpy as np
-from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.files import storage_errors
+from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.files import storage_errors
+from tap_ros.base.options import Bags, File, Folder
+from tap_ros.base.text import escaped
 from tap_ros.images.drawing import png_bytes
-from tap_ros.options import Bags, File, Folder
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.formats.lerobot import (
     ACTION,
@@ -37,7 +38,6 @@ from tap_ros.recording.formats.lerobot import (
 from tap_ros.recording.marks import Mark, read_marks
 from tap_ros.recording.reading import reading_of, ReadingOptions
 from tap_ros.robots.arm import DEFAULT_ARM
-from tap_ros.text import escaped
 from tqdm import tqdm
 
 EPISODES_PER_FILE = 100

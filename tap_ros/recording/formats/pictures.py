@@ -20,11 +20,12 @@ import warnings
 
 import cv2
 import numpy as np
-from tap_ros.contract import MAX_PICTURE_BYTES
-from tap_ros.errors import ConfigError, ImageError, RecordingError
-from tap_ros.files import only_writer, storage_errors
+from tap_ros.base.contract import MAX_PICTURE_BYTES
+from tap_ros.base.errors import ConfigError, ImageError, RecordingError
+from tap_ros.base.files import only_writer, storage_errors
+from tap_ros.base.options import default_text, Folder
+from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
-from tap_ros.options import default_text, Folder
 from tap_ros.recording.damage import describe, Loss
 from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.file_bytes import what_else
@@ -33,7 +34,6 @@ from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading import Part
 from tap_ros.recording.trust import inside, MOST_BYTES, MOST_FRAMES, regular
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
-from tap_ros.text import escaped, listing
 from tqdm import tqdm
 from tyro import conf
 

@@ -24,7 +24,8 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from google.protobuf.unknown_fields import UnknownFieldSet  # type: ignore[import-untyped]
 import google_crc32c
 import numpy as np
-from tap_ros.errors import ConfigError, ImageError, RecordingError
+from tap_ros.base.errors import ConfigError, ImageError, RecordingError
+from tap_ros.base.text import escaped, listing
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import (
@@ -35,7 +36,6 @@ from tap_ros.recording.formats.pictures import (
     Options,
     write_bag,
 )
-from tap_ros.text import escaped, listing
 
 _FILES = b'\xff\xd8\xff', b'\x89PNG'  # JPEG, PNG
 

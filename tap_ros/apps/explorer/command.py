@@ -1,0 +1,70 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m tap_ros explore`: all nodes, and a page in the browser to try them."""
+
+from dataclasses import dataclass
+import time
+from typing import Annotated
+
+from sim_bridge.tasks.tasks import task_names
+from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
+from tap_ros.apps.demo.command import new_folder
+from tap_ros.apps.node_processes import NodeProcesses
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.options import Folder, one_of
+from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param task: of the first scene; its predictor is the one that is started.
+    :param seed: of the first scene.
+    :param look: of the world, see sim_node.
+    :param objects: whether tracker_node follows those that are clicked, or the simulator tells.
+    :param host: address at which browsers find the page; 0.0.0.0: of every network of this
+        machine, with a token.
+    :param port: of the page; 0: any that is free.
+    :param token: that browsers must give; empty: made up where one is needed.
+    :param logs: folder for the nodes' logs; a number is added when it exists.
+    """
+
+    task: Annotated[str, one_of(task_names())] = 'push2'
+    seed: int = 1_000_000
+    look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
+    objects: Annotated[str, one_of(('tracked', 'truth'))] = 'tracked'
+    host: str = '127.0.0.1'
+    port: int = 8000
+    token: str = ''
+    logs: Folder = 'runs/explore'
+
+
+def run(args: Options) -> None:
+    """
+    Start the nodes, say where the page is, and wait for Ctrl-C.
+
+    :raises ConfigError: for a port or seed that there is not.
+    :raises NodeEnded: when a node ends; the message has the end of its log.
+    """
+    if not 0 <= args.port < 2**16 or args.seed < 0:
+        raise ConfigError('port: expected 0 to 65535; seed: 0 or more')
+    folder = new_folder(args.logs)
+    with NodeProcesses(folder) as processes:
+        # In lock-step a scene waits for those who look at it, however slow the machine is.
+        processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,
+                        look=args.look, objects=args.objects)
+        if args.objects == 'tracked':
+            processes.start('tracker_node')
+        processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
+                        else DEFAULT_PREDICTOR)
+        processes.start('visual_mpc_node')
+        token = {'token': args.token} if args.token else {}
+        processes.start('explorer_node', host=args.host, port=args.port, task=args.task, **token)
+        print(f'starting nodes; their logs are in {folder}', flush=True)
+        print(f'open {processes.wait_until_ready()} in a browser; Ctrl-C ends all nodes',
+              flush=True)
+        while True:
+            time.sleep(0.2)
+            processes.check()

@@ -1,0 +1,170 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What browsers are shown, and goals made by hand of it where no simulator takes goal pictures."""
+
+from collections.abc import Mapping
+from functools import cache
+import math
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+from tap_msgs.msg import ObjectStates, Subgoal
+from tap_ros.base.errors import TapError
+from tap_ros.base.plugins import load_plugin
+from tap_ros.base.text import escaped, listing
+from tap_ros.images.drawing import overlay, png_bytes
+from tap_ros.messages.images import decode_image
+from tap_ros.messages.subgoals import decode_subgoal
+from tap_ros.ros.calls import CallError
+from tap_ros.ros.ros_messages import encode_objects
+from tap_ros.ros.topics import LATCHED
+from tap_ros.tracking.protocols import SEEN
+
+SILENT_S = 2.0  # after which the page says that a topic is silent
+LARGEST = 640  # px; larger pictures are made smaller for the page
+LOSSLESS = 256  # px; larger ones are sent as JPEG
+NEAR = 0.06  # of the picture's width: so near are two pixels of one object
+
+Place = tuple[float, float]  # u, v in pixels
+
+
+def picture_of(message: Any, kind: str) -> np.ndarray:
+    """Return what is shown of a message: uint8 (H, W, 3); of a Subgoal with its maps."""
+    if not isinstance(message, Subgoal):
+        return decode_image(message, kind)
+    one = decode_subgoal(
+        message, message.object_names, (message.image.height, message.image.width))
+    return overlay(one.image, one.object_maps)
+
+
+def picture_bytes(image: np.ndarray, lossless: bool) -> bytes:
+    """Encode a picture, a large one made smaller; PNG where it is small or `lossless`."""
+    height, width = image.shape[:2]
+    share = LARGEST / max(width, height)
+    if share < 1:
+        size = [max(1, round(share * side)) for side in (width, height)]
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    if lossless or max(width, height) <= LOSSLESS:
+        return png_bytes(image)
+    return cv2.imencode('.jpg', image[..., ::-1])[1].tobytes()
+
+
+def listed(places: Mapping[str, Place], message: ObjectStates | None = None
+           ) -> list[dict[str, Any]]:
+    """Return places as the page takes them; with what their message says of how sure they are."""
+    known = {one.name: {'state': state, 'confidence': round(confidence, 2)}
+             for one, state, confidence in zip(
+                 message.objects, message.states, message.confidence)} if message else {}
+    return [{'name': name, 'u': round(u, 2), 'v': round(v, 2), **known.get(name, {})}
+            for name, (u, v) in places.items()]
+
+
+def silence(now: float, newest: tuple[Any, float] | None) -> str:
+    """Say since when a topic is silent, in steps that do not change with every look."""
+    if newest is None:
+        return 'nothing has come yet'
+    age = now - newest[1]
+    return f'silent for {age:.0f} s' if age > SILENT_S else ''
+
+
+@cache
+def grips(task: str) -> bool:
+    """Tell whether a task needs a gripper, which nothing plans; False for an unknown one."""
+    try:
+        return bool(getattr(load_plugin('tap_ros.tasks', task), 'gripping', False))
+    except TapError:
+        return False
+
+
+class GoalByHand:
+    """
+    Publishes goal pictures and goal objects.
+
+    :param node: rclpy Node.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._made: dict[type, Any] = {}  # publishers; a goal that is not ours has none
+
+    def photograph(self, camera: tuple[Any, float] | None, followed: bool) -> None:
+        """
+        Publish a picture of the camera as the goal.
+
+        :param camera: its newest message and when that was received, if there is one.
+        :param followed: whether a node follows objects, and finds them there; else no object is
+            where it was in the goal before.
+        :raises CallError: where that is of no use.
+        """
+        message, received = camera or (None, -math.inf)
+        if time.monotonic() - received > SILENT_S:
+            raise CallError('photograph: the camera is silent; no picture to take')
+        if not isinstance(message, Image):
+            raise CallError('photograph: a goal picture is sensor_msgs/Image; start with '
+                            'image_transport:=raw')
+        if not followed:
+            self._publish(ObjectStates(header=message.header), 'goal/objects')
+        self._publish(message, 'goal/image')
+
+    def place(self, name: str, pixel: Place, newest: Mapping[str, Any]) -> None:
+        """
+        Publish goal objects of which one is elsewhere.
+
+        With a goal picture it is a pixel of that; the others are where they were found in it.
+        Without one it is a pixel of the camera's picture; what has no goal is to stay where it is.
+
+        :param newest: messages 'objects', 'goal_objects' and 'goal', where there are some.
+        :raises CallError: when no object has this name.
+        """
+        objects, goals = (_by_name(newest.get(kind)) for kind in ('objects', 'goal_objects'))
+        if name not in objects:
+            raise CallError(f'{escaped(name)} is not followed; the objects are '
+                            f'{listing(objects) or "none"}')
+        of = newest.get('goal', newest['objects'])
+        if 'goal' not in newest:
+            goals = objects | goals
+        elif goals and newest['goal_objects'].header.stamp != of.header.stamp:
+            goals = {}  # in another goal picture
+        goals = {each: goal for each, goal in goals.items() if each in objects}
+        goals[name] = *pixel, SEEN, 1.0
+        u, v, states, confidence = zip(*goals.values())
+        self._publish(encode_objects(
+            goals, np.column_stack([u, v]), None, of.header.stamp, of.header.frame_id,
+            ObjectStates.SOURCE_TRACKED, states, confidence), 'goal/objects')
+
+    def _publish(self, message: Any, topic: str) -> None:
+        kind = type(message)
+        if kind not in self._made:
+            self._made[kind] = self._node.create_publisher(kind, topic, LATCHED)
+        self._made[kind].publish(message)
+
+
+def simulated(name: str, pixel: Place, goals: Mapping[str, Place],
+              truth: Mapping[str, Place], width: int) -> dict[str, Place]:
+    """
+    Return what the simulator calls an object, and where it is to put its goal; {} if nowhere.
+
+    :param pixel: in the goal picture.
+    :param goals: of the objects; those that are followed have names of their own, and the pixels
+        of their middles.
+    :param truth: what the simulator says where it is asked only for measuring, else empty.
+    :param width: of the goal picture.
+    """
+    if name not in goals or not truth:
+        return {name: pixel} if name in goals else {}
+    nearest = min(truth, key=lambda each: math.dist(truth[each], goals[name]))
+    du, dv = np.subtract(truth[nearest], goals[name]).tolist()
+    return {nearest: (pixel[0] + du, pixel[1] + dv)} if math.hypot(du, dv) < NEAR * width else {}
+
+
+def _by_name(message: ObjectStates | None) -> dict[str, tuple[float, float, str, float]]:
+    """Return pixel (u, v), state and confidence by name."""
+    if message is None:
+        return {}
+    return {one.name: (one.u, one.v, state, confidence) for one, state, confidence in zip(
+        message.objects, message.states or [SEEN] * len(message.objects),
+        message.confidence or [1.0] * len(message.objects))}

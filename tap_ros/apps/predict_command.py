@@ -1,0 +1,216 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m tap_ros predict`: subgoals from picture files, as a labelled picture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import io
+from pathlib import Path
+import sys
+from typing import Annotated, TYPE_CHECKING
+
+import numpy as np
+from tap_ros.base.errors import ConfigError, ImageError
+from tap_ros.base.files import write_atomically
+from tap_ros.base.options import File
+from tap_ros.base.text import escaped
+from tap_ros.images.crop import Crop
+from tap_ros.images.encodings import decompress
+from tap_ros.images.pixels import in_picture, resize_image, resize_pixels
+from tap_ros.recording.reading import Part
+from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
+from tyro import conf
+
+if TYPE_CHECKING:
+    from tap_ros.messages.subgoals import Subgoal
+
+PANEL = 2.6  # inches, side of a picture
+DPI = 100
+_LARGEST = 2 ** 29  # bytes of rgb, of a picture file; phones make larger ones than cameras stream
+FAINT = 0.5  # mass of a map, below which an object is hardly in the prediction
+
+_Pixels = conf.arg(metavar='U,V [U,V ...]', help_behavior_hint='(default: none)')
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param start: picture file: JPEG, PNG or WebP.
+    :param goal: likewise; left out for weights that predict from the start alone.
+    :param objects: where the objects are in the start picture: column and row of each, in the
+        pixels of the file.
+    :param goal_objects: where the same objects are in the goal picture, in the same order.
+    :param crop: the square part of the pictures that is used: 'centre', the largest one in the
+        middle, or LEFT,TOP,SIDE in pixels of the file; by default as the weights were trained.
+    :param samples: how many to draw of weights with z.
+    :param recursion: subgoals in a row.
+    :param seed: of z; the same one draws the same samples.
+    :param out: PNG file to write: start, goal and subgoals, with maps of where objects are then.
+    """
+
+    start: Annotated[conf.Positional[str], conf.arg(metavar='START')]
+    goal: Annotated[conf.Positional[str], conf.arg(
+        metavar='GOAL', help_behavior_hint='(default: none)')] = ''
+    weights: Annotated[str, conf.arg(
+        metavar='FILE', help='a file; shipped ones: ' + ', '.join(PREDICTORS)
+        + '; or another predictor, such as nearest_keyframe:bags/push2.'
+    )] = DEFAULT_PREDICTOR
+    objects: Annotated[tuple[str, ...], _Pixels] = ()
+    goal_objects: Annotated[tuple[str, ...], _Pixels] = ()
+    crop: Part = ''
+    samples: int = 1
+    recursion: int = 1
+    seed: int = 0
+    out: File = 'subgoal.png'
+
+
+def run(args: Options) -> None:
+    """
+    Predict, print where the objects should then be, and write the picture.
+
+    :raises TapError: for a file, pixels or weights that cannot be used, saying why.
+    """
+    from tap_ros.prediction.protocol import load_predictor
+    if Path(args.out).suffix.lower() != '.png':
+        raise ConfigError(f'--out {escaped(args.out)}: expected a .png file')
+    if Path(args.out).resolve() in (Path(args.start).resolve(), Path(args.goal).resolve()):
+        raise ConfigError(f'--out {escaped(args.out)}: is a picture to predict from; give another')
+    predictor = load_predictor(args.weights)
+    size = predictor.image_size
+    pictures = {'start': read_picture(args.start)}
+    if args.goal:
+        pictures['goal'] = read_picture(args.goal)
+    pixels = {'start': read_pixels(args.objects, '--objects'),
+              'goal': read_pixels(args.goal_objects, '--goal-objects')}
+    if not args.goal and len(pixels['goal']):
+        raise ConfigError('--goal-objects: there is no goal picture; name it behind the start')
+    if args.goal and len(pixels['start']) != len(pixels['goal']):
+        raise ConfigError(
+            f'--objects and --goal-objects: {len(pixels["start"])} and {len(pixels["goal"])} '
+            'positions; give those of the same objects in both pictures')
+    scaled, places, windows = {}, {}, {}
+    for name, picture in pictures.items():
+        cut = Crop(args.crop) if args.crop else predictor.camera_crop.of(picture.shape[:2], name)
+        if not args.crop and (why := predictor.camera_crop.unlike(picture.shape[:2], name)):
+            print(f'warning: {why}', file=sys.stderr)
+        windows[name] = Crop(cut.part).window(picture.shape[:2])
+        scaled[name], places[name] = fit(picture, windows[name], pixels[name], size, name)
+    subgoals = predictor.predict(
+        scaled['start'], scaled.get('goal'), places['start'], places.get('goal'),
+        num_samples=args.samples, recursion_depth=args.recursion, seed=args.seed)
+    left, top, *extent = windows['start']
+    for subgoal in subgoals:
+        print(f'{_title(subgoal, len(subgoals))}{":" if len(places["start"]) else ""}')
+        for k, (where, mass) in enumerate(zip(subgoal.expected_pixels, subgoal.mass), start=1):
+            u, v = (where + 0.5) * extent / size[::-1] - 0.5 + (left, top)
+            faint = ', hardly in the picture' if mass < FAINT else ''
+            print(f'  object {k} at {u:.1f},{v:.1f} (mass {mass:.2f}{faint})')
+    write_atomically(args.out, labelled(scaled, places, subgoals))
+    print(f'written: {escaped(args.out)}')
+
+
+def read_picture(path: str | Path) -> np.ndarray:
+    """
+    Read a picture file just as a compressed picture of a recording or a camera is read.
+
+    :param path: of a JPEG, PNG or WebP file.
+    :return: uint8 (H, W, 3) rgb.
+    :raises ImageError: when it is no picture, or is damaged; OSError: when it is not there.
+    """
+    try:
+        return decompress(Path(path).read_bytes(), Path(path).suffix[1:], _LARGEST)
+    except ImageError as error:
+        raise ImageError(f'{escaped(path)}: {error}') from error
+
+
+def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
+    """
+    Read positions.
+
+    :param words: list of 'u,v'.
+    :param option: that they were given with.
+    :return: float32 (K, 2), (u, v).
+    :raises ConfigError: for a word that is none.
+    """
+    pixels = []
+    for word in words:
+        try:
+            u, v = (float(number) for number in word.split(','))
+        except ValueError:
+            raise ConfigError(f'{option} {escaped(word)}: expected column,row of an object, such '
+                              'as 20,30') from None
+        pixels.append((u, v))
+    return np.array(pixels, np.float32).reshape(-1, 2)
+
+
+def fit(picture: np.ndarray, window: Sequence[int], pixels: np.ndarray, size: Sequence[int],
+        name: str) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Cut and scale a picture, and positions in it, to what the weights take.
+
+    :param picture: uint8 (H, W, 3).
+    :param window: left, top, width and height of the part, as wide as high if `size` is.
+    :param pixels: (K, 2), (u, v) in the picture.
+    :param size: (height, width).
+    :param name: how errors call it.
+    :return: uint8 (height, width, 3) and float32 (K, 2).
+    :raises ImageError: for another shape, or a position outside.
+    """
+    left, top, W, H = window
+    if W * size[0] != H * size[1]:
+        raise ImageError(f'{name}: {W}x{H} pixels (width x height); the weights take pictures of '
+                         f'the shape {size[1]}x{size[0]}; say which part of it is used, by --crop '
+                         'centre or --crop LEFT,TOP,SIDE')
+    inside = pixels - np.array([left, top], np.float32)
+    if not in_picture(inside, (H, W)).all():
+        raise ImageError(
+            f'{name}: an object is outside the part that the weights see, {W}x{H} pixels from '
+            f'column {left}, row {top} on; expected column,row in the picture as it is in the '
+            'file; leave others out in both pictures')
+    return (resize_image(picture[top:top + H, left:left + W], size),
+            resize_pixels(inside, (H, W), size))
+
+
+def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
+             subgoals: Sequence['Subgoal']) -> bytes:
+    """
+    Draw a picture for people.
+
+    :param pictures: 'start' and perhaps 'goal', uint8 (H, W, 3).
+    :param pixels: of the objects in these, (K, 2) each.
+    :param subgoals: list of Subgoal; a row for each, its maps beside it where there are objects.
+    :return: bytes of a PNG file.
+    """
+    from matplotlib.figure import Figure
+    from tap_ros.images.drawing import OBJECT_COLOURS, overlay
+    count = len(pixels['start'])
+    columns = len(pictures) + 1 + bool(count)
+    figure = Figure(figsize=(PANEL * columns, (PANEL + 0.3) * len(subgoals)), dpi=DPI,
+                    layout='constrained')
+    axes = figure.subplots(len(subgoals), columns, squeeze=False)
+    for row, subgoal in zip(axes, subgoals):
+        panels = [(name, picture, pixels[name]) for name, picture in pictures.items()]
+        panels.append((_title(subgoal, len(subgoals)), subgoal.image, pixels['start'][:0]))
+        if count:
+            panels.append(('where the objects are then', overlay(
+                subgoal.image, subgoal.object_maps), subgoal.expected_pixels))
+        for panel, (title, picture, marks) in zip(row, panels):
+            panel.imshow(picture, interpolation='nearest')
+            panel.set_title(title, fontsize=10)
+            panel.set_axis_off()
+            for k, (u, v) in enumerate(marks):
+                colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)]) / 255
+                panel.annotate(
+                    str(k + 1), (u, v), xytext=(8, 8), textcoords='offset points', color='white',
+                    fontsize=9, arrowprops={'arrowstyle': '-', 'color': colour},
+                    bbox={'boxstyle': 'circle,pad=0.15', 'facecolor': colour, 'linewidth': 0})
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='png')
+    return buffer.getvalue()
+
+
+def _title(subgoal: 'Subgoal', count: int) -> str:
+    """Say which subgoal it is."""
+    return 'subgoal' if count == 1 else f'sample {subgoal.sample + 1}, level {subgoal.level}'

@@ -1,0 +1,137 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Calls with a time-out, of a node that another thread spins."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+import threading
+import time
+from typing import Any, Self
+
+from rclpy.client import Client
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.task import Future
+from tap_ros.base.errors import TapError
+from tap_ros.ros.heartbeat import Liveness
+from tap_ros.ros.services import log_error, wait_for_some
+from tap_ros.ros.subscriptions import PollOnlyGroup
+
+POLL_S = 0.05  # between two looks at whether a server is still there
+
+
+class CallError(TapError):
+    """A service, action or topic did not answer in time, or refused."""
+
+
+class Spinner:
+    """
+    Spin a node in the background, for as long as the with-block lasts.
+
+    A thread that keeps spinning answers ten times faster than spinning once per call.
+
+    :param node: rclpy Node; destroying it stays with the caller.
+    :ivar answers: callback group for service clients: another thread takes their answers, without
+        the executor, which looks at everything that the node has, three times for an answer.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node, self.answers = node, PollOnlyGroup()
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._stop = threading.Event()
+        spin = partial(self._executor.spin_once, timeout_sec=0.1)
+        self._threads = [
+            threading.Thread(target=self._repeat, args=(do,), name=name, daemon=True)
+            for do, name in ((spin, 'spinner'), (self._take_answers, 'answers'))]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+        self._executor.shutdown(timeout_sec=1.0)
+
+    def _repeat(self, do: Callable[[], object]) -> None:
+        """Do something until the end, whatever it raises: a node whose thread ends is deaf."""
+        while not self._stop.is_set():
+            try:
+                do()
+            except (InvalidHandle, ExternalShutdownException):
+                self._stop.wait(0.001)  # another thread has destroyed something just now
+            except Exception as error:
+                log_error(self._node, 'a callback failed; the node goes on', error)
+
+    def _take_answers(self) -> None:
+        clients = [one for one in self._node.clients if one.callback_group is self.answers]
+        if not clients:
+            self._stop.wait(POLL_S)
+            return
+        for client in wait_for_some(self._node.context, clients):
+            header, answer = client.handle.take_response(client.srv_type.Response)
+            if header is not None:
+                with suppress(KeyError):  # given up
+                    client.get_pending_request(
+                        header.request_id.sequence_number).set_result(answer)
+
+
+def call(client: Client, request: Any, timeout_s: float,
+         give_up: Callable[[], bool] = lambda: False, server: Liveness | None = None) -> Any:
+    """
+    Call a service from a thread that does not spin the node.
+
+    :param client: rclpy Client of a node that another thread spins.
+    :param request: the service's request.
+    :param timeout_s: most seconds to wait for the service and its answer together.
+    :param give_up: asked several times a second whether to stop waiting.
+    :param server: heartbeat.Liveness of the node that offers it, by which a new process of the
+        same name is told from the one that was asked; None: without.
+    :return: the response.
+    :raises CallError: when the service is not there, leaves the ROS graph, or does not answer in
+        time, or when the wait was given up.
+    """
+    deadline = time.monotonic() + timeout_s
+    name, node = f'service {client.service_name}', 'its node' if server is None else server.name
+    while not client.service_is_ready():
+        if time.monotonic() >= deadline or give_up():
+            raise CallError(f'{name}: nobody offers it after {timeout_s:g} s; start {node} and '
+                            'wait until it says that it is ready')
+        time.sleep(min(POLL_S, timeout_s))
+    presence = None if server is None else server.presence()
+    future = client.call_async(request)
+    try:
+        if not wait_for_answer(
+                future, deadline, f'{name}: {node} has left the ROS graph during the call: it has '
+                'ended or stands still', lambda: not client.service_is_ready() or (
+                    presence is not None and presence.gone), give_up):
+            raise CallError(f'{name}: no answer within {timeout_s:g} s; '
+                            + (server and server.silence or f'{node} may be busy or stopped'))
+    finally:
+        client.remove_pending_request(future)  # else a lost call stays pending for ever
+    return future.result()
+
+
+def wait_for_answer(future: Future, deadline: float, left: str, gone: Callable[[], bool],
+                    give_up: Callable[[], bool] = lambda: False) -> bool:
+    """
+    Wait for what a server answers, however long it is silent.
+
+    :param deadline: monotonic time.
+    :param left: what to say when its server has left the ROS graph, as `gone` tells.
+    :return: whether it has come.
+    :raises CallError: with `left`.
+    """
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    while not (future.done() or done.wait(min(POLL_S, max(deadline - time.monotonic(), 0.0)))):
+        if gone():
+            raise CallError(left)
+        if time.monotonic() >= deadline or give_up():
+            return False
+    return True

@@ -1,0 +1,200 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters with a description and a range, and those that several nodes have."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+import math
+from typing import Any
+
+import numpy as np
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from tap_ros.base.contract import ROBOT_MASKS
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.plugins import names
+from tap_ros.base.text import listing
+from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
+
+FARTHEST = 100.0  # m; no camera is there
+# Of several nodes: default, description, and what else Parameters.declare takes.
+SHARED: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    'autostart': (
+        True, 'Load the weights and be active at once; false: wait for the transitions configure '
+        'and activate.', {}),
+    'device': (
+        'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
+        {'choices': ('cpu', 'cuda')}),
+    'image_transport': (
+        'raw', 'How the camera sends pictures: sensor_msgs/Image on camera/image_raw (raw), or '
+        'CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).',
+        {'choices': ('raw', 'compressed')}),
+    'robot_mask': (
+        'none', 'What camera/robot_mask takes out of the pictures: nothing (none), the arm with '
+        'its shadow (arm), or the whole robot (all). What was seen there free last takes its '
+        'place.', {'choices': ROBOT_MASKS}),
+    'joint_prefix': (
+        '', "What the names of the robot's joints begin with in joint_states, before "
+        'shoulder_pan_joint and so on.', {})}
+
+
+class Parameters:
+    """
+    The parameters of one node: declare each once, then read them by name.
+
+    :param node: rclpy Node.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._choices: dict[str, tuple[str, ...]] = {}
+        node.add_on_set_parameters_callback(self._check_choices)
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the present value."""
+        return self._node.get_parameter(name).value
+
+    def declare(self, name: str, default: Any, description: str, low: float | None = None,
+                high: float | None = None, choices: Sequence[str] | None = None,
+                read_only: bool = True) -> Any:
+        """
+        Declare one parameter and return its value.
+
+        :param name: name of the parameter.
+        :param default: its value unless one is given at the start; also sets the type.
+        :param description: one sentence with the unit.
+        :param low: smallest value of a number; goes with `high`.
+        :param high: largest value of a number.
+        :param choices: the only values of a string.
+        :param read_only: False if a running node heeds a change.
+        :return: the value.
+        :raises ConfigError: when the value given at the start is of another type or out of range.
+        """
+        descriptor = ParameterDescriptor(description=description, read_only=read_only)
+        if low is not None and high is not None and isinstance(default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(low), to_value=float(high))]
+        elif low is not None:
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+        if choices is not None:
+            self._choices[name] = tuple(choices)
+            descriptor.additional_constraints = 'one of: ' + ', '.join(choices)
+        try:
+            return self._node.declare_parameter(name, default, descriptor).value
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            reason = str(error).split('Reason: ')[-1].removesuffix(f': {name}')
+            raise ConfigError(
+                f'parameter {name}: {reason}. {description} Default: {default!r}') from error
+
+    def declare_shared(self, *names: str, **defaults: Any) -> None:
+        """Declare some of SHARED, with their usual or with other defaults."""
+        for name in (*names, *defaults):
+            default, description, limits = SHARED[name]
+            self.declare(name, defaults.get(name, default), description, **limits)
+
+    def declare_arm(self) -> None:
+        """Declare arm, mount and opening: used for joint states that lack the gripper's."""
+        arm = self.declare(
+            'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
+            'joints and not gripper_x.', choices=names('tap_ros.arms'))
+        self.declare_mount(arm)
+        self.declare('fixed_opening', 0.0,
+                     'Opening of the gripper, 0 to 1, where no joint_states has '
+                     'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
+
+    def declare_mount(self, arm: str) -> None:
+        """Declare the place of an arm; by default at the simulated table."""
+        default = get_arm(arm).mount
+        for axis, value in zip('xyz', default.position):
+            self.declare(
+                f'mount_{axis}', value, f'{axis} of the base of the arm in the world, m; of its '
+                'controller\'s frame "base".', low=-10.0, high=10.0)
+        self.declare('mount_turn', default.yaw,
+                     'Turn of that frame about the vertical, rad; the base stands upright.',
+                     low=-2 * math.pi, high=2 * math.pi)
+        self.declare('tool_length', default.tool,
+                     'From the flange to the fingertips along its z, m.', low=0.0, high=2.0)
+
+    def declare_camera(self, frame: str) -> None:
+        """Declare the pose of the camera in a frame, and what counts of its camera_info."""
+        for axis in 'xyz':
+            self.declare(f'camera_{axis}', 0.0, f'{axis} of the camera in {frame}, m.',
+                         low=-FARTHEST, high=FARTHEST)
+        for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
+            self.declare(
+                f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
+                f'optical frame (z forward, x right, y down in the picture) into {frame}.',
+                low=-1.0, high=1.0)
+        self.declare('rectified', False,
+                     'The pictures are rectified: P of camera_info counts, else K.')
+
+    def camera_pose(self) -> np.ndarray:
+        """
+        Return the pose (4, 4) of the camera, by the parameters of declare_camera.
+
+        :raises ConfigError: for a quaternion of length 0, and for numbers of no pose.
+        """
+        place, quaternion = ([self[f'camera_{axis}'] for axis in axes]
+                             for axes in ('xyz', ('qx', 'qy', 'qz', 'qw')))
+        try:
+            return pose_matrix(place, quaternion)
+        except ConfigError as error:
+            raise ConfigError(f'parameters camera_x to camera_qw: {error}') from error
+
+    def _check_choices(self, parameters: Iterable[Parameter]) -> SetParametersResult:
+        """Refuse strings that are none of the choices."""
+        for parameter in parameters:
+            choices = self._choices.get(parameter.name)
+            if choices is not None and parameter.value not in choices:
+                return SetParametersResult(
+                    successful=False,
+                    reason=f'{parameter.name} is {parameter.value!r}; '
+                           f'valid choices: {", ".join(choices)}')
+        return SetParametersResult(successful=True)
+
+
+def check_device(device: str) -> None:
+    """
+    Raise ConfigError for a device that is not available.
+
+    :param device: 'cpu' or 'cuda'.
+    """
+    import torch  # here, since it takes seconds, and not every node has a device
+    if device == 'cuda' and not torch.cuda.is_available():
+        raise ConfigError('parameter device: torch finds no GPU for cuda; valid here: cpu')
+
+
+def pose_matrix(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
+    """
+    Return a pose (4, 4) of a place (3,), m, and a quaternion x, y, z, w of any length.
+
+    :raises ConfigError: for a quaternion of length 0, and for numbers of no pose.
+    """
+    from scipy.spatial.transform import Rotation  # later, since not every node needs it
+    if not (np.abs([*place, *quaternion]) <= FARTHEST).all():
+        raise ConfigError(f'a pose of {listing([*place, *quaternion])}; expected numbers up to '
+                          f'{FARTHEST:g}')
+    if not np.linalg.norm(quaternion) > 0.1:
+        raise ConfigError('a quaternion of no direction')
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    pose[:3, 3] = place
+    return pose
+
+
+def declared_arm(parameters: Parameters) -> Arm:
+    """Return the Arm at its place, by the parameters of declare_arm."""
+    return replace(get_arm(parameters['arm']), mount=declared_mount(parameters))
+
+
+def declared_mount(parameters: Parameters) -> Mount:
+    """Return the place of the arm, by the parameters of declare_mount."""
+    x, y, z = (parameters[f'mount_{axis}'] for axis in 'xyz')
+    return Mount((x, y, z), parameters['mount_turn'], parameters['tool_length'])

@@ -1,0 +1,372 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Goals of reach_goal: sent with an id of our own, and cancelled by it whoever gives up."""
+
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from contextlib import suppress
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+import secrets
+import threading
+import time
+from typing import Any
+
+from action_msgs.msg import GoalInfo, GoalStatus
+from action_msgs.srv import CancelGoal
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.task import Future
+from tap_msgs.action import ReachGoal
+from tap_ros.base.contract import NODE_CLASSES
+from tap_ros.ros.calls import call, CallError, POLL_S, wait_for_answer
+from tap_ros.ros.heartbeat import Liveness, Presence, publishers_present
+from tap_ros.ros.services import log_error
+from tap_ros.ros.subscriptions import UNKNOWN
+
+ACTION = 'reach_goal'
+STATUS, FEEDBACK = f'{ACTION}/_action/status', f'{ACTION}/_action/feedback'
+CANCEL = f'{ACTION}/_action/cancel_goal'
+CLIENT = 'tap_ros_client_'  # begins the name of a Client's own node
+SENDER_BYTES = 12  # of a goal's id: of its sender's process
+ANSWER_S = 5.0  # until an answer to a goal is held to be lost, and the goal is sent anew
+CANCEL_S = 1.0  # until a cancel that is not answered is sent again
+CLOSE_S = 5.0  # that cancelling may take when a client ends: more than a dead planner's lease
+ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_CANCELED: 'cancelled',
+        GoalStatus.STATUS_ABORTED: 'aborted'}
+
+
+class Goals:
+    """
+    The goals that a node has sent: none is left without an owner.
+
+    What is given up is cancelled by its id, again and again until the planner has answered, in a
+    thread of its own. All that have not ended are given up by close.
+
+    :param node: rclpy Node that another thread spins.
+    :param server: Liveness of the planner.
+    :param group: callback group of the action; answers: of the service that cancels.
+    """
+
+    def __init__(self, node: Node, server: Liveness, group: CallbackGroup,
+                 answers: CallbackGroup) -> None:
+        self.node, self.server = node, server
+        self.action = ActionClient(node, ReachGoal, ACTION, callback_group=group)
+        self._cancels = node.create_client(CancelGoal, CANCEL, callback_group=answers)
+        self._changed = threading.Condition()
+        self._open: set[Reaching] = set()
+        self._unwanted: set[Reaching] = set()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='cancelling', daemon=True)
+        self._thread.start()
+
+    def new_id(self) -> Any:
+        """Return the id of a goal; the planner watches whom its first bytes name."""
+        own = {one for one, *name in _listeners(self.node)
+               if name == [self.node.get_name(), self.node.get_namespace()]}
+        sender = own.pop() if len(own) == 1 else secrets.token_bytes(SENDER_BYTES)
+        goal_id = GoalInfo().goal_id
+        goal_id.uuid = list(sender + secrets.token_bytes(16 - SENDER_BYTES))
+        return goal_id
+
+    def add(self, goal: 'Reaching') -> None:
+        """Become the owner of a goal that is about to be sent."""
+        with self._changed:
+            if self._closed.is_set():
+                raise CallError(f'action {ACTION}: the client was closed')
+            self._open.add(goal)
+
+    def ended(self, goal: 'Reaching') -> None:
+        """Forget a goal that has ended, or was never sent."""
+        with self._changed:
+            self._open.discard(goal)
+            self._unwanted.discard(goal)
+            self._changed.notify_all()
+
+    def unwanted(self, goal: 'Reaching') -> None:
+        """Cancel a goal until the planner has answered."""
+        with self._changed:
+            self._unwanted |= {goal} & self._open
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Cancel what has not ended; wait until that was answered or the planner is gone."""
+        with self._changed:
+            goals = list(self._open)
+        for goal in goals:
+            goal.cancel()
+        deadline = time.monotonic() + CLOSE_S
+        while time.monotonic() < deadline and self.node.context.ok():
+            with self._changed:
+                if all(goal.planner_gone for goal in self._unwanted):
+                    break
+                self._changed.wait(POLL_S)
+        self._closed.set()
+        with self._changed:
+            self._changed.notify_all()
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        while not self._closed.is_set():
+            with self._changed:
+                self._changed.wait_for(lambda: self._unwanted or self._closed.is_set())
+                goals = list(self._unwanted)
+            for goal in goals:
+                if self.try_cancel(goal):
+                    self.ended(goal)
+            self._closed.wait(POLL_S)
+
+    def try_cancel(self, goal: 'Reaching') -> bool:
+        """Ask once for the end of a goal; return whether nobody can pursue it any more."""
+        with suppress(Exception):  # whatever it is, one asks until it is answered
+            return goal.is_cancelled_by(lambda request: call(
+                self._cancels, request, CANCEL_S, self._closed.is_set))
+        return False
+
+
+@dataclass(frozen=True)
+class ReachResult:
+    """
+    How a goal ended.
+
+    :param end: 'succeeded' (also when the budget was spent), 'cancelled' or 'aborted'.
+    :param success: whether the goal was reached.
+    :param message: why not, or what was reached.
+    :param steps: commands sent.
+    :param expected_distance: px, mean over the objects, at the end.
+    """
+
+    end: str
+    success: bool
+    message: str
+    steps: int
+    expected_distance: float
+
+
+class Reaching:
+    """
+    A goal that the planner pursues; iterate over it for feedback until it ends.
+
+    A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px), planning_ms and
+    plan_samples.
+    Leaving the iteration, or dropping this object, cancels nothing: its client still owns the
+    goal, and cancels it when it is closed. A wait that fails or is interrupted cancels it.
+
+    :param goals: Goals of the node that sends it.
+    :param goal: the action's goal.
+    :param timeout_s: most seconds until the end; whoever waits for longer cancels the goal.
+    :param accept_s: most seconds until it is accepted.
+    :param on_feedback: called with each feedback by another thread; where it raises, the goal is
+        cancelled. Without it they are kept for the iteration.
+    :raises CallError: when no planner answers in time, or it rejects the goal.
+    """
+
+    def __init__(self, goals: Goals, goal: ReachGoal.Goal, timeout_s: float, accept_s: float,
+                 on_feedback: Callable[[Any], object] | None = None) -> None:
+        self._goals, self._timeout_s, self._name = goals, timeout_s, f'action {ACTION}'
+        self._deadline = time.monotonic() + timeout_s
+        self._feedback: SimpleQueue[Any] = SimpleQueue()
+        self._take = on_feedback or self._feedback.put
+        self._id = goals.new_id()
+        self._lock = threading.Lock()  # nothing is sent after it was given up
+        self._given_up = self._sent_anew = False
+        self._accepted: Future | None = None  # once it was sent
+        self._answer: Future | None = None
+        self._presence: Presence | None = None  # of the planner that it was sent to
+        goals.add(self)
+        try:
+            self._begin(goal, min(accept_s, timeout_s))
+        except BaseException:  # an interrupt, too
+            self.cancel()
+            raise
+
+    def __iter__(self) -> Iterator[Any]:
+        while not (self._feedback.empty() and self._is_over()):
+            try:
+                feedback = self._feedback.get(timeout=POLL_S)
+            except Empty:
+                continue
+            except BaseException:
+                self.cancel()
+                raise
+            yield feedback
+        self.result()  # raises what has ended it
+
+    def cancel(self) -> None:
+        """Have the goal cancelled, until the planner has answered; result tells the end."""
+        with self._lock:
+            self._given_up = True
+            sent = self._accepted is not None
+        if sent:
+            self._goals.unwanted(self)
+        else:
+            self._goals.ended(self)
+
+    def result(self) -> ReachResult:
+        """
+        Wait for the end.
+
+        :raises CallError: when the planner leaves the ROS graph before, or the goal takes longer
+            than it was given; then it is cancelled.
+        """
+        assert self._answer is not None
+        try:
+            if not wait_for_answer(
+                    self._answer, self._deadline, f'{self._name}: {self._server.name} has left '
+                    'the ROS graph before the goal ended; what the arm does now is up to its '
+                    'driver', lambda: self.planner_gone):
+                raise CallError(
+                    f'the goal has not ended within {self._timeout_s:g} s and is cancelled'
+                    + (self._server.silence and f'; {self._server.silence}'))
+        except BaseException:
+            self.cancel()
+            raise
+        answer = self._answer.result()
+        if answer.status == GoalStatus.STATUS_UNKNOWN:
+            raise CallError('the action server does not know the goal; was it started anew?')
+        result = answer.result
+        return ReachResult(ENDS[answer.status], result.success, result.message, result.steps,
+                           result.expected_distance)
+
+    @property
+    def planner_gone(self) -> bool:
+        """Whether the planner that it was sent to has left the ROS graph."""
+        return not self._goals.action.server_is_ready() or (
+            self._presence is not None and self._presence.gone)
+
+    def is_cancelled_by(self, ask: Callable[[CancelGoal.Request], CancelGoal.Response]) -> bool:
+        """
+        Ask once for the end of the goal; return whether nobody can pursue it any more.
+
+        :param ask: sends the request, and returns the answer.
+        :raises CallError: without an answer.
+        """
+        accepted = self._accepted
+        answered = accepted is not None and accepted.done()  # before this asks
+        answer = ask(CancelGoal.Request(goal_info=GoalInfo(goal_id=self._id)))
+        if answer.return_code == CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID:
+            # A cancel may overtake its goal; a new planner knows no goal of the one before.
+            return answered or self.planner_gone
+        return answer.return_code == CancelGoal.Response.ERROR_GOAL_TERMINATED or any(
+            one.goal_id == self._id for one in answer.goals_canceling)
+
+    @property
+    def _server(self) -> Liveness:
+        return self._goals.server
+
+    def _begin(self, goal: ReachGoal.Goal, accept_s: float) -> None:
+        """Send the goal, and wait until it is accepted."""
+        deadline, server = time.monotonic() + accept_s, self._server
+        while not self._goals.action.server_is_ready():
+            if time.monotonic() >= deadline:
+                raise CallError(
+                    f'{self._name}: nobody offers it after {accept_s:g} s; start {server.name}')
+            time.sleep(POLL_S)
+        self._presence = publishers_present(self._goals.node, STATUS)
+        while not (accepted := self._sent(goal, deadline, accept_s)).accepted:
+            if not self._sent_anew or time.monotonic() >= deadline:
+                self._goals.ended(self)
+                raise CallError(f'{self._name}: the goal was rejected; the log of {server.name} '
+                                'says why')
+            time.sleep(CANCEL_S)  # the one whose answer was lost has yet to end
+        self._answer = self._in_executor(accepted.get_result_async, deadline)
+        self._answer.add_done_callback(lambda _: self._goals.ended(self))
+
+    def _sent(self, goal: ReachGoal.Goal, deadline: float, accept_s: float) -> ClientGoalHandle:
+        """
+        Return the planner's answer to the goal.
+
+        An answer is lost when it leaves before the planner has discovered who waits for it. Then
+        the goal is cancelled, and sent anew under another id.
+        """
+        server = self._server
+        while True:
+            answer = self._in_executor(lambda: self._send(goal), deadline)
+            if wait_for_answer(
+                    answer, min(deadline, time.monotonic() + ANSWER_S), f'{self._name}: '
+                    f'{server.name} has left the ROS graph before it answered',
+                    lambda: self.planner_gone):
+                return answer.result()
+            while time.monotonic() < deadline and not self._goals.try_cancel(self):
+                time.sleep(POLL_S)
+            if time.monotonic() >= deadline:
+                raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; '
+                                + (server.silence or f'{server.name} may be busy or stopped'))
+            self._id, self._sent_anew = self._goals.new_id(), True
+
+    def _send(self, goal: ReachGoal.Goal) -> Future:
+        goal_id = self._id
+
+        def take(message: Any) -> None:
+            try:
+                if goal_id == self._id:
+                    self._take(message.feedback)
+            except Exception as error:  # it would end the thread that spins the node
+                log_error(self._goals.node, f'{self._name}: on_feedback', error)
+                self.cancel()
+
+        with self._lock:
+            if self._given_up:
+                raise CallError(f'{self._name}: given up')
+            self._accepted = self._goals.action.send_goal_async(goal, take, goal_id)
+            return self._accepted
+
+    def _is_over(self) -> bool:
+        """Return whether result would return or raise at once."""
+        assert self._answer is not None
+        return (self._answer.done() or time.monotonic() > self._deadline or self.planner_gone)
+
+    def _in_executor(self, function: Callable[[], Future], deadline: float) -> Future:
+        """
+        Return what a function returns, called in the thread that spins the node.
+
+        rclpy's action client takes down a request only after it was sent: an answer that another
+        thread handles in between is lost.
+
+        :raises CallError: when the node is not spun, or its thread is busy until the deadline.
+        """
+        node, outcome = self._goals.node, futures.Future[Future]()
+
+        def run() -> None:
+            try:
+                outcome.set_result(function())
+            except Exception as error:  # it would end the executor
+                outcome.set_exception(error)
+
+        if node.executor is None:
+            raise CallError(f'node {node.get_name()} is not spun')
+        node.executor.create_task(run)
+        try:
+            return outcome.result(max(deadline - time.monotonic(), POLL_S))
+        except futures.TimeoutError as error:
+            raise CallError(f'node {node.get_name()}: its callbacks keep it busy') from error
+
+
+def watch_sender(node: Node, goal_id: bytes) -> Callable[[], bool]:
+    """
+    Return a function that tells whether who has sent a goal has left the ROS graph.
+
+    A Client of this package is known by the id. Of other programs it is known that they listen to
+    the feedback of their goals: none may be left of those that did when the goal was accepted.
+    Our own programs listen, too, but have not sent a goal whose id names none of them.
+
+    :param node: that serves the goal; goal_id: its 16 bytes.
+    """
+    def there() -> set[bytes]:
+        return {one for one, *_ in _listeners(node)}
+
+    def strangers() -> set[bytes]:
+        return {one for one, name, _ in _listeners(node)
+                if name not in {UNKNOWN, *NODE_CLASSES} and not name.startswith(CLIENT)}
+
+    sender = Presence(lambda: there() & {goal_id[:SENDER_BYTES]})
+    others, listeners = Presence(strangers), Presence(there)
+    return lambda: sender.gone or (not sender.there and (others.gone or listeners.gone))
+
+
+def _listeners(node: Node) -> list[tuple[bytes, str, str]]:
+    """Return process, name and namespace of those that take feedback, as clients do."""
+    return [(bytes(info.endpoint_gid[:SENDER_BYTES]), info.node_name, info.node_namespace)
+            for info in node.get_subscriptions_info_by_topic(node.resolve_topic_name(FEEDBACK))]

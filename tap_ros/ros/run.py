@@ -1,0 +1,174 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Starting and ending a node process, and how Fast DDS is set up for it."""
+
+from collections.abc import Callable, MutableMapping
+from difflib import get_close_matches
+from importlib import import_module
+import os
+from pathlib import Path
+import signal
+import sys
+import threading
+from typing import Any
+
+import rclpy
+from rclpy import executors
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from tap_ros.base.contract import NODE_CLASSES
+from tap_ros.base.errors import TapError
+from tap_ros.base.text import escaped, listing
+from tap_ros.ros.heartbeat import Heartbeat
+from tap_ros.ros.services import log_error
+
+SUBNET = Path(__file__).with_name('fastdds_subnet.xml')
+LOCALHOST = Path(__file__).with_name('fastdds_localhost.xml')
+PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+CHOICES = (PROFILE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS')
+FAST_DDS = (None, '', 'rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
+RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+LOCALHOST_ONLY = 'ROS_LOCALHOST_ONLY'  # older than RANGE, and takes precedence
+
+
+class _Ended(BaseException):
+    """A signal came while the node started."""
+
+
+def main(name: str = '', args: list[str] | None = None) -> int:
+    """
+    Run one node until SIGINT, SIGTERM, or its terminal is closed; what all executables call.
+
+    On a signal the running callback is finished and `node.close()` is called before ROS shuts
+    down: rclpy's own signal handlers would end the context first, and neither a last command nor a
+    last episode mark could be sent. `close` is called whatever ends the node. An exception in a
+    callback is logged, and the node goes on.
+
+    A TapError of its constructor is fatal. The attribute num_threads of its class says how many
+    threads callbacks have; by default it is the calling one alone.
+
+    :param name: of the node, one of NODE_CLASSES; by default that of the executable.
+    :param args: command-line arguments, None for those of the process.
+    :return: exit code: 1 when the node could not be started, or when close returns 1.
+    """
+    name = name or Path(sys.argv[0]).name
+    module, class_name = NODE_CLASSES[name].split(':')
+    node_class = getattr(import_module(module), class_name)
+    stop = threading.Event()
+
+    def end(*_: Any) -> None:
+        # Not KeyboardInterrupt: after one that leaves an exec(), as in making a dataclass, Python
+        # ends by SIGINT even where it was caught.
+        stop.set()
+        raise _Ended
+
+    node = executor = heartbeat = None
+    code = 0
+    try:
+        _handle_signals(end)
+        configure_fast_dds()
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = node_class()
+        warn_of_unknown_parameters(node)
+        _handle_signals(lambda *_: stop.set())
+        num_threads = getattr(node_class, 'num_threads', 1)
+        executor = (executors.SingleThreadedExecutor() if num_threads == 1
+                    else executors.MultiThreadedExecutor(num_threads))
+        executor.add_node(node)
+        heartbeat = Heartbeat(node)
+        while rclpy.ok() and not stop.is_set():
+            _spin_once(executor, node)
+    except (_Ended, KeyboardInterrupt, executors.ExternalShutdownException):
+        pass
+    except (TapError, RuntimeError) as error:
+        if not stop.is_set():  # else it is a consequence of the signal
+            code = 1
+            if isinstance(error, TapError):
+                rclpy.logging.get_logger(name).fatal(escaped(error, 1000))
+            elif node is not None or rclpy.ok():
+                raise
+            else:  # what follows --ros-args cannot be parsed
+                print(f'{name}: {escaped(error, 1000)}', file=sys.stderr)
+    finally:
+        _handle_signals(lambda *_: None)  # it is ending already
+        if node is not None:
+            code = _close(node) or code  # first of all: it stops the arm
+        if heartbeat is not None:
+            heartbeat.end()
+        if executor is not None:
+            executor.shutdown(timeout_sec=2.0)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return code
+
+
+def warn_of_unknown_parameters(node: Node) -> None:
+    """Warn of parameters that were given to a node and that it does not have."""
+    known = list(node._parameters)
+    for name in sorted(set(node._parameter_overrides) - set(known)):
+        near = get_close_matches(name, known, 1) or known
+        node.get_logger().warning(
+            f'parameter {escaped(name)} is unknown to this node and has no effect; '
+            + (f'did you mean {near[0]}?' if len(near) == 1 else f'it has {listing(near, 50)}'))
+
+
+def configure_fast_dds(environ: MutableMapping[str, str] = os.environ) -> None:
+    """
+    Let Fast DDS drop this process 3 s after its death, and use UDP alone.
+
+    By default it waits for 20 s, and until then others send calls of its services to it. Much
+    less than 3 s is too little on a loaded machine: a node that is dropped and comes back can
+    lose what is sent to it for a while. Shared memory is left out as Fast DDS 2.14 loses what a
+    process sends to one that was killed and started again (its pull request 4728).
+
+    To be called before rclpy.init. Another middleware, and profiles or transports that the user
+    has chosen, are left alone; so is LOCALHOST with ROS_STATIC_PEERS, where rmw_fastrtps adds
+    shared memory.
+
+    :param environ: the variables of this process, which rclpy.init reads.
+    """
+    if environ.get('RMW_IMPLEMENTATION') not in FAST_DDS or any(
+            name in environ for name in CHOICES):
+        return
+    profile = SUBNET
+    alone = environ.get(LOCALHOST_ONLY) == '1'
+    local = alone or environ.get(RANGE, '').upper() == 'LOCALHOST'
+    if local and (alone or not environ.get('ROS_STATIC_PEERS')):
+        profile = LOCALHOST
+    if not profile.is_file():  # without it the range must stay as it is
+        return
+    environ[PROFILE] = str(profile)
+    if profile is LOCALHOST:  # rmw_fastrtps leaves the system's default alone
+        environ.pop(LOCALHOST_ONLY, None)
+        environ[RANGE] = 'SYSTEM_DEFAULT'
+
+
+def _handle_signals(handler: Callable[[int, Any], Any]) -> None:
+    """Handle what ends a node. A shell ignores SIGINT for jobs in the background; nodes do not."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT):
+        signal.signal(number, handler)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        signal.signal(signal.SIGHUP, handler)
+
+
+def _spin_once(executor: executors.Executor, node: Node) -> None:
+    """Run what is ready; a signal is noticed after 0.1 s at most."""
+    try:
+        executor.spin_once(timeout_sec=0.1)
+    except (KeyboardInterrupt, executors.ExternalShutdownException):
+        raise
+    except InvalidHandle:  # of what another thread destroyed just now
+        pass
+    except Exception as error:
+        log_error(node, 'a callback failed; the node goes on', error)
+
+
+def _close(node: Any) -> int:
+    """Let the node end what it does; return its exit code."""
+    try:
+        return node.close() or 0
+    except Exception as error:
+        log_error(node, 'the node did not end cleanly', error)
+        return 1

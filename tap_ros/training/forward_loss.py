@@ -1,0 +1,208 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The forward model's training loss: pictures reconstructed along whole rollouts.
+
+First the windows of recordings that it is taken over, and their augmentation.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Self, TYPE_CHECKING
+
+import numpy as np
+from tap_ros.base.contract import GRIPPER_JOINTS
+from tap_ros.base.errors import RecordingError
+from tap_ros.images.pixels import to_float
+from tap_ros.images.robot_mask import hidden_pixels, RobotMask
+from tap_ros.planning.forward_model import LearnedForwardModel
+from tap_ros.planning.table import mirror_table
+import torch
+from torch.nn import functional as F
+
+if TYPE_CHECKING:
+    from tap_ros.training.inpainted import Episodes
+
+COLOUR_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
+MOTION_FACTOR = 8.0  # extra weight of pixels that changed since the window's first picture
+STILL_WEIGHT = 2e-4  # of the mean share of the crop that is said to move
+# Of the mean share of the picture that is said to be objects: with none, a table with grain counts
+# as one, too.
+OBJECT_WEIGHT = 5e-3
+MOTION_THRESHOLD = 0.08  # of the range 2: mean channel difference that counts as change
+
+
+@dataclass
+class Windows:
+    """A batch of B windows of T steps, that is T + 1 pictures."""
+
+    images: torch.Tensor  # (B, T + 1, 3, H, W) in [-1, 1]
+    hidden: torch.Tensor  # (B, T + 1, 1, H, W) bool, where the robot hides what is compared
+    grippers: torch.Tensor  # (B, T + 1, 4) metres and opening
+    actions: torch.Tensor  # (B, T, 4)
+    homography: torch.Tensor  # (B, 3, 3) table metres to pixels; differs where mirrored
+    mirrored: torch.Tensor  # (B,) bool
+    colours: torch.Tensor  # (B, 3) int64: channel i shows what was channel colours[i]
+
+    def to(self, device: torch.device | str) -> 'Windows':
+        """Copy everything to a device."""
+        return Windows(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class Cuts:
+    """
+    Which windows are read, of B, and how they are changed; by default not at all.
+
+    :param episodes: (B,) episode indices; starts: (B,) first frames; steps: T.
+    :param mirrored: bool (B,), left to right; orders: (B,), index to COLOUR_ORDERS.
+    """
+
+    episodes: np.ndarray | Sequence[int]
+    starts: np.ndarray | Sequence[int]
+    steps: int
+    mirrored: np.ndarray | bool = False
+    orders: np.ndarray | int = 0
+
+    @classmethod
+    def draw(cls, store: 'Episodes', episodes: np.ndarray, batch_size: int, steps: int,
+             rng: np.random.Generator) -> Self:
+        """Draw from episodes, each with more than `steps` frames; half of them are mirrored."""
+        chosen = rng.choice(episodes, batch_size)
+        lengths = np.asarray(store.lengths)[chosen]
+        starts = (rng.random(batch_size) * (lengths - steps)).astype(int)
+        return cls(chosen, starts, steps, rng.random(batch_size) < 0.5,
+                   rng.integers(len(COLOUR_ORDERS), size=batch_size))
+
+
+def make_windows(store: 'Episodes', cuts: Cuts, homography: torch.Tensor,
+                 robot_mask: RobotMask = 'none') -> Windows:
+    """
+    Read windows and change how they look: mirrored left to right, in other colours.
+
+    :param homography: (3, 3) of the table.
+    :param robot_mask: see robot_mask.hidden_pixels; the episodes have masks unless it is 'none'.
+    :return: Windows; the grippers and actions of mirrored ones have x negated.
+    :raises RecordingError: where gripper positions are missing.
+    """
+    images, grippers, actions, hidden = [], [], [], []
+    for i, start in zip(cuts.episodes, cuts.starts):
+        episode, part = store[int(i)], slice(start, start + cuts.steps + 1)
+        images.append(episode.frames[part])
+        grippers.append(episode.grippers[part])
+        actions.append(episode.actions[start:start + cuts.steps])
+        if robot_mask == 'none' or episode.robot_masks is None:
+            hidden.append(np.zeros(images[-1].shape[:-1], bool))
+        else:
+            hidden.append(hidden_pixels(episode.robot_masks[part], robot_mask))
+    hands = np.stack(grippers).astype(np.float32)
+    if not np.isfinite(hands).all():
+        bad = int(np.asarray(cuts.episodes)[~np.isfinite(hands).all((1, 2))][0])
+        raise RecordingError(
+            f'/joint_states: episode {bad} lacks gripper positions; the forward model needs '
+            f'{", ".join(GRIPPER_JOINTS)} at every picture')
+    B = len(images)
+    batch = Windows(
+        to_float(np.stack(images)), torch.from_numpy(np.stack(hidden)[:, :, None]),
+        torch.from_numpy(hands), torch.from_numpy(np.stack(actions).astype(np.float32)),
+        homography.expand(B, 3, 3).clone(), torch.from_numpy(np.full(B, cuts.mirrored)),
+        torch.tensor(COLOUR_ORDERS)[np.full(B, cuts.orders)])
+    batch.images = recolour(batch.images, batch.colours[:, None])
+    batch.images = mirror(batch.images, batch.mirrored)
+    batch.hidden = mirror(batch.hidden, batch.mirrored)
+    batch.grippers[batch.mirrored, :, 0] *= -1
+    batch.actions[batch.mirrored, :, 0] *= -1
+    batch.homography[batch.mirrored] = mirror_table(
+        batch.homography, batch.images.shape[-1])[batch.mirrored]
+    return batch
+
+
+def recolour(images: torch.Tensor, colours: torch.Tensor) -> torch.Tensor:
+    """Reorder the first three channels of images (B, ..., C, H, W) by colours (B, ..., 3)."""
+    index = colours[..., None, None].expand(*images.shape[:-3], 3, *images.shape[-2:])
+    return torch.cat([images[..., :3, :, :].gather(-3, index), images[..., 3:, :, :]], -3)
+
+
+def mirror(images: torch.Tensor, mirrored: torch.Tensor) -> torch.Tensor:
+    """Flip those images (B, ..., H, W) left to right that are mirrored (B,)."""
+    shape = [-1] + [1] * (images.ndim - 1)
+    return torch.where(mirrored.view(shape), images.flip(-1), images)
+
+
+def draw_arm_like(model: LearnedForwardModel, grippers: torch.Tensor, mirrored: torch.Tensor,
+                  colours: torch.Tensor) -> torch.Tensor:
+    """
+    Draw the arm as it looks in augmented pictures.
+
+    :param grippers: (B, 4) as augmented; mirrored (B,) bool; colours (B, 3) channel orders.
+    :return: (B, 4, H, W), see LearnedForwardModel.draw_arm.
+    """
+    sign = 1 - 2 * mirrored.float()
+    plain = torch.cat([grippers[:, :1] * sign[:, None], grippers[:, 1:]], 1)
+    return mirror(recolour(model.draw_arm(plain), colours), mirrored)
+
+
+def motion_weight(target: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
+    """
+    Weight pixels that differ from the first picture, and their neighbours, by 1 + MOTION_FACTOR.
+
+    Most of a picture never changes; without this weight, predicting no motion is nearly perfect.
+
+    :param target: (B, 3, H, W); first (B, 3, H, W).
+    :return: (B, 1, H, W).
+    """
+    changed = ((target - first).abs().mean(1, keepdim=True) > MOTION_THRESHOLD).float()
+    return 1 + MOTION_FACTOR * F.max_pool2d(changed, 3, 1, 1)
+
+
+def picture_loss(predicted: torch.Tensor, target: torch.Tensor,
+                 weight: torch.Tensor) -> torch.Tensor:
+    """
+    Weighted l1 at full, half and quarter resolution, so that flow finds objects pixels away.
+
+    :param predicted: (B, 3, H, W); target (B, 3, H, W); weight (B, 1, H, W).
+    :return: scalar.
+    """
+    total = weight.new_zeros(())
+    for scale in range(3):
+        if scale:
+            predicted, target = F.avg_pool2d(predicted, 2), F.avg_pool2d(target, 2)
+            weight = F.avg_pool2d(weight, 2)
+        total = total + (weight * (predicted - target).abs()).mean()
+    return total / 3
+
+
+def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Collection[int],
+                 ) -> tuple[torch.Tensor, dict[str, float]]:
+    """
+    Roll the model along the windows and compare pictures at some of the steps.
+
+    What the robot hides in a picture is compared with nothing. Where the model moves something
+    counts as much as where something moved, else it would rather see pushes where there are none.
+
+    :param picture_steps: indices in 1..T of the pictures compared.
+    :return: loss, dict of its parts.
+    """
+    arms = draw_arm_like(model, batch.grippers[:, 0], batch.mirrored, batch.colours)
+    first = batch.images[:, 0]
+    scene = model.look(first, arms[:, 3:].detach(), batch.homography)
+    flow, gripper = model.still(len(first)), batch.grippers[:, 0]
+    pictures = moving = first.new_zeros(())
+    count = batch.actions.shape[1]
+    for t in range(1, count + 1):
+        action = batch.actions[:, t - 1]
+        flow, gripper, masks = model.advance(scene.features, flow, gripper, action)
+        moving = moving + (1 - masks[:, 2]).mean()
+        if t in picture_steps:
+            arm = draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
+            predicted, _ = model.picture(scene, flow, arm, batch.homography)
+            target = batch.images[:, t]
+            predicted = torch.where(batch.hidden[:, t], target, predicted)
+            weight = torch.maximum(*(motion_weight(picture, first)
+                                     for picture in (target, predicted.detach())))
+            pictures = pictures + picture_loss(predicted, target, weight)
+    parts = {'picture': pictures / len(picture_steps), 'moving': moving / count,
+             'objects': scene.objects[:, 3].mean()}
+    loss = (parts['picture'] + STILL_WEIGHT * parts['moving']
+            + OBJECT_WEIGHT * parts['objects'])
+    return loss, {k: float(v.detach()) for k, v in parts.items()}

@@ -1,0 +1,110 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which frame a prediction is trained towards: the selection error E' and its argmin (Eq. 5)."""
+
+from collections.abc import Callable
+import math
+
+from tap_ros.images.pixels import to_float
+from tap_ros.prediction import losses
+from tap_ros.training.batches import Batch
+from tap_ros.training.predictor_config import TrainingConfig
+import torch
+
+
+def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor], batch: Batch,
+                     config: TrainingConfig) -> torch.Tensor:
+    """
+    Compute E'_t of Eq. 5 for the configured method: E_t / w(t) in the paper (section 3.2).
+
+    The preference w(t) is linear in forward prediction, else a bell. With w = 1 this is the
+    minimum over time (Eq. 2).
+
+    :param error: (B, T), of the prediction against each target.
+    :param copy_error: function without arguments that returns (B, C, T), the errors of the context
+        pictures against each target.
+    :return: (B, T).
+    """
+    if config.loss == 'min':
+        return error
+    if config.selection in ('marks', 'still'):
+        assert batch.preference is not None, 'made before the training'
+        return losses.relative_to_copying(error, copy_error(), batch.preference[:, 0])
+    preference = (losses.linear_preference(batch.times, batch.end, config.beta) if config.forward
+                  else losses.bell_preference(batch.times, batch.first, batch.last))
+    if config.selection == 'relative':
+        return losses.relative_to_copying(error, copy_error(), preference)
+    if config.selection == 'progress':
+        progress = losses.picture_progress(copy_error(), batch.valid)
+        if config.progress_margin:
+            hidden = losses.beside_context(progress, config.progress_margin, batch.valid)
+            error = error.masked_fill(hidden, math.inf)
+        return error / losses.bell(progress)
+    return error / preference
+
+
+class Targets:
+    """
+    The frames of a batch that predictions are compared with, and what predictions come from.
+
+    :ivar context: (B, C, 3, H, W) in [-1, 1], augmented.
+    :ivar measured: the same as errors are measured with it, see Batch.measured.
+    """
+
+    def __init__(self, batch: Batch, config: TrainingConfig) -> None:
+        self.batch, self.augmentation, self.config = batch, batch.augmentation, config
+        self.rows = torch.arange(len(batch.context), device=batch.context.device)
+        self.context = self.augmented(batch.context)
+        self.measured = self.context if batch.bare is None else self.augmented(batch.bare)
+
+    def augmented(self, pictures: torch.Tensor) -> torch.Tensor:
+        """Return pictures, uint8 (B, N, H, W, 3), as networks see them, (B, N, 3, H, W)."""
+        images = to_float(pictures)
+        return self.augmentation.apply(images) if self.augmentation else images
+
+    def frame(self, step: torch.Tensor) -> torch.Tensor:
+        """Return the augmented frames (B, 3, H, W) at indices step (B,) into T."""
+        return self.augmented(self.batch.targets[self.rows, step][:, None])[:, 0]
+
+    def visible(self, image: torch.Tensor) -> torch.Tensor:
+        """Return augmented pictures (B, 3, H, W), black where targets are, see Batch.visible."""
+        if self.batch.seen is None:
+            return image
+        seen = self.batch.seen
+        if self.augmentation:
+            seen = torch.where(self.augmentation.flip[:, None, None], seen.flip(-1), seen)
+        return image.masked_fill(~seen[:, None], -1)
+
+    def match(self, image: torch.Tensor, context: torch.Tensor,
+              batch: Batch | None = None) -> torch.Tensor:
+        """
+        Find the target that each prediction is trained towards, the argmin of Eq. 5.
+
+        Chosen among the frames as recorded: undoing the augmentation of one picture is cheaper
+        than applying it to all targets.
+
+        :param image: (B, 3, H, W), predictions, augmented.
+        :param context: (B, C, 3, H, W), what they come from, as errors are measured with it.
+        :param batch: with the valid targets and the bounds of the preference, where these are not
+            the batch's own.
+        :return: int64 (B,), indices into T.
+        """
+        batch = batch or self.batch
+        if self.config.only_fraction is not None:
+            return torch.zeros_like(self.rows)  # the batch begins with the fixed frame
+        if self.config.loss == 'fix':  # at the frame of the largest w
+            assert batch.preference is not None, 'made before the training'
+            return batch.preference[:, 0].masked_fill(~batch.valid, -1).argmax(1)
+        error = self.errors(image.detach()[:, None])[:, 0]
+        return losses.match_step(selection_errors(
+            error, lambda: self.errors(context.detach()), batch, self.config), batch.valid)
+
+    def errors(self, images: torch.Tensor) -> torch.Tensor:
+        """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
+        if self.augmentation:
+            images = self.augmentation.undo(images)
+        return losses.l1_errors(self.batch.visible(images), self.batch.targets.movedim(-1, 2))
+
+    def l1(self, image: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """Return the l1 errors (B,) of predictions (B, 3, H, W) at targets (B,) of T."""
+        return losses.l1_error(self.visible(image), self.frame(step))

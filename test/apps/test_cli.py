@@ -1,0 +1,70 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: help, errors, and what needs no ROS."""
+
+from pathlib import Path
+import sys
+
+import pytest
+from tap_ros.apps.cli import COMMANDS, main
+from tap_ros.recording.cache import open_recordings
+from tap_ros.weights import FORWARD_MODEL, PREDICTORS
+
+ROOT = Path(__file__).parents[2]
+SAMPLE = ROOT / 'bags' / 'sample_push2'
+
+
+@pytest.mark.parametrize('arguments, named', [
+    (['inspect', 'nowhere.mcap'], 'nowhere.mcap'),
+    (['inspect', 'nowhere.safetensors'], 'nowhere.safetensors'),
+    (['train', 'predictor', 'nowhere', '--out', 'somewhere'], 'nowhere'),
+])
+def test_an_error_names_the_file_and_is_one_line(arguments, named, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 1
+    error = capsys.readouterr().err.strip()
+    assert error.startswith('error: ') and named in error and '\n' not in error
+
+
+def test_collect_then_inspect(tmp_path, capsys):
+    folder, picture = tmp_path / 'push', tmp_path / 'strips.png'
+    assert main(['collect', '--out', str(folder), '--episodes', '2', '--seed', '3']) == 0
+    assert [episode.seed for episode in open_recordings(folder)] == [3, 4]
+    assert main(['inspect', str(folder), '--picture', str(picture)]) == 0
+    assert '2 episodes' in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b'\x89PNG')
+
+
+@pytest.mark.parametrize('path', [FORWARD_MODEL, *PREDICTORS.values()], ids=lambda path: path.stem)
+def test_shipped_weights_say_what_they_are(path, capsys):
+    assert main(['inspect', str(path)]) == 0
+    assert 'data_hash' in capsys.readouterr().out
+    card = path.with_suffix('.md').read_text()
+    assert 'python -m tap_ros train' in card or 'python -m experiments paper' in card
+    assert 'python -m tap_ros collect' in card and path.name in card
+
+
+def test_the_sample_recording_is_readable():
+    episodes = list(open_recordings(SAMPLE))
+    assert len(episodes) == 20
+    assert all(episode.task == 'push2' and len(episode.frames) <= 50 for episode in episodes)
+
+
+def test_names_of_files_do_not_reach_the_terminal_raw(tmp_path, capsys):
+    forged = tmp_path / 'a\n\x1b[31mFORGED.mcap'
+    forged.write_bytes(b'nothing')
+    assert main(['inspect', str(forged)]) == 1
+    output = ''.join(capsys.readouterr())
+    assert r'a\n\x1b[31mFORGED.mcap' in output and '\x1b' not in output
+    assert len(output.splitlines()) == 1
+
+
+def test_a_missing_package_is_named_and_others_are_not_hidden(
+        capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    for name in ('pyarrow', 'nosuch'):
+        monkeypatch.setitem(COMMANDS, name, ('', name))
+    assert main(['pyarrow']) == 1
+    assert 'pip install pyarrow' in capsys.readouterr().err
+    with pytest.raises(ModuleNotFoundError):
+        main(['nosuch'])
