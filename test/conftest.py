@@ -44,9 +44,15 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
-    """Fail a test in which a node logged a traceback or an error that no `errors` mark names."""
+    """
+    Fail a test in which a node logged a traceback or an error that no `errors` mark names.
+
+    One that failed shows the logs.
+    """
     report = yield
     processes = sys.modules.get('processes')  # else there is no node
+    if call.when == 'call' and report.failed and processes is not None:
+        report.sections.append(('logs of the nodes, their ends', processes.ends()))
     if call.when == 'teardown' and processes is not None:
         wrong = processes.unexpected(report.capstderr + processes.news(), [
             pattern for other in item.session.items if other.path == item.path

@@ -37,6 +37,11 @@ def news():
     return text
 
 
+def ends():
+    """Return what the nodes have logged last, as far as news has not told it yet."""
+    return '\n'.join(f'{process.name}:\n{process.text[-2000:]}' for process in _unread)
+
+
 def unexpected(log, expected):
     """Return what is wrong with the logs of nodes, '' if nothing is; see errors_in."""
     lines = errors_in(log, expected)

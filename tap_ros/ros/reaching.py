@@ -53,7 +53,8 @@ class Goals:
     def __init__(self, node: Node, server: Liveness, group: CallbackGroup,
                  answers: CallbackGroup) -> None:
         self.node, self.server = node, server
-        self.action = ActionClient(node, ReachGoal, ACTION, callback_group=group)
+        self._group = group
+        self.renew()
         self._cancels = node.create_client(CancelGoal, CANCEL, callback_group=answers)
         self._changed = threading.Condition()
         self._open: set[Reaching] = set()
@@ -61,6 +62,19 @@ class Goals:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name='cancelling', daemon=True)
         self._thread.start()
+
+    def renew(self) -> None:
+        """
+        Send and hear by new endpoints: Fast DDS can fail to match one with a planner for good.
+
+        The node keeps the old ones, as its executor may be waiting for them.
+        """
+        self.action = ActionClient(self.node, ReachGoal, ACTION, callback_group=self._group)
+
+    @property
+    def planner_there(self) -> bool:
+        """Whether a planner is in the ROS graph."""
+        return bool(self._cancels.service_is_ready())
 
     def new_id(self) -> Any:
         """Return the id of a goal; the planner watches whom its first bytes name."""
@@ -233,7 +247,7 @@ class Reaching:
     @property
     def planner_gone(self) -> bool:
         """Whether the planner that it was sent to has left the ROS graph."""
-        return not self._goals.action.server_is_ready() or (
+        return not self._goals.planner_there or (
             self._presence is not None and self._presence.gone)
 
     def is_cancelled_by(self, ask: Callable[[CancelGoal.Request], CancelGoal.Response]) -> bool:
@@ -258,18 +272,14 @@ class Reaching:
 
     def _begin(self, goal: ReachGoal.Goal, accept_s: float) -> None:
         """Send the goal, and wait until it is accepted."""
-        deadline, server = time.monotonic() + accept_s, self._server
-        while not self._goals.action.server_is_ready():
-            if time.monotonic() >= deadline:
-                raise CallError(
-                    f'{self._name}: nobody offers it after {accept_s:g} s; start {server.name}')
-            time.sleep(POLL_S)
+        deadline = time.monotonic() + accept_s
+        self._wait_for_planner(deadline, accept_s)
         self._presence = publishers_present(self._goals.node, STATUS)
         while not (accepted := self._sent(goal, deadline, accept_s)).accepted:
             if not self._sent_anew or time.monotonic() >= deadline:
                 self._goals.ended(self)
-                raise CallError(f'{self._name}: the goal was rejected; the log of {server.name} '
-                                'says why')
+                raise CallError(f'{self._name}: the goal was rejected; the log of '
+                                f'{self._server.name} says why')
             time.sleep(CANCEL_S)  # the one whose answer was lost has yet to end
         self._answer = self._in_executor(accepted.get_result_async, deadline)
         self._answer.add_done_callback(lambda _: self._goals.ended(self))
@@ -279,7 +289,7 @@ class Reaching:
         Return the planner's answer to the goal.
 
         An answer is lost when it leaves before the planner has discovered who waits for it. Then
-        the goal is cancelled, and sent anew under another id.
+        the goal is cancelled, and sent anew under another id, by new endpoints.
         """
         server = self._server
         while True:
@@ -294,7 +304,16 @@ class Reaching:
             if time.monotonic() >= deadline:
                 raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; '
                                 + (server.silence or f'{server.name} may be busy or stopped'))
+            self._goals.renew()
+            self._wait_for_planner(deadline, accept_s)
             self._id, self._sent_anew = self._goals.new_id(), True
+
+    def _wait_for_planner(self, deadline: float, accept_s: float) -> None:
+        while not self._goals.action.server_is_ready():
+            if time.monotonic() >= deadline:
+                raise CallError(f'{self._name}: nobody offers it after {accept_s:g} s; start '
+                                f'{self._server.name}')
+            time.sleep(POLL_S)
 
     def _send(self, goal: ReachGoal.Goal) -> Future:
         goal_id = self._id

@@ -71,8 +71,9 @@ def test_an_interrupted_run_leaves_no_worker(tmp_path):
               '    list(run_tasks([Work("slow", write_slowly, (sys.argv[1], 300.0))]))')
     (tmp_path / 'script.py').write_text(script)
     path = tmp_path / 'file'
-    process = subprocess.Popen([sys.executable, tmp_path / 'script.py', path, ROOT, ROOT / 'test' / 'base'],
-                               stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, tmp_path / 'script.py', path, ROOT, ROOT / 'test' / 'base'],
+        stderr=subprocess.PIPE)
     while not (begun := list(tmp_path.glob('file.*'))) and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
