@@ -151,7 +151,7 @@ class NodeProcess:
         """Send a signal; return the exit code, None when it had to be killed after a time."""
         self.send(number)
         try:
-            return self.process.wait(timeout_s)
+            return self.process.wait(PATIENCE * timeout_s)
         except subprocess.TimeoutExpired:
             self.kill()
             return None
