@@ -25,10 +25,10 @@ from tap_ros.base.plugins import names
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.robots.arm import DEFAULT_ARM
+from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
 from tap_ros.ros.parameters import Parameters
-from tap_ros.ros.services import answering
 from tap_ros.ros.subscriptions import steady_timer
 from tap_ros.ros.topics import LATCHED, LOCK_STEP, SERVICE_QOS, STREAM, to_stamp
 
@@ -318,9 +318,9 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('world', 'mujoco_table', 'The simulated world; other packages may add '
                        'some.', choices=names('tap_ros.worlds'))
     parameters.declare('task', 'push2', 'Task of the first scene, one that the world has.')
-    parameters.declare('seed', 0, 'Seed of the first scene.', low=0, high=2**62)
+    parameters.declare('seed', 0, 'Seed of the first scene.', between=(0, 2**62))
     parameters.declare('image_size', 64, 'Width and height of the pictures in pixels.',
-                       low=16, high=1024)
+                       between=(16, 1024))
     parameters.declare(
         'look', OPTIONS['look'],
         "What the camera's pictures show: the whole arm at a wooden table, or its hand alone.",
@@ -342,7 +342,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare(
         'resend_period', 0.2,
         'Seconds after which, in lock-step, the newest picture is sent again.',
-        low=0.02, high=10.0)
+        between=(0.02, 10.0))
     parameters.declare('real_time_factor', 1.0,
-                       'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
+                       'Simulated seconds per second when not in lock-step.', between=(0.05, 20.0))
     return parameters

@@ -1,29 +1,81 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Calls with a time-out, of a node that another thread spins."""
+"""Calls with a time-out, services that answer whatever happens, and nodes that are spun."""
 
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+import inspect
 import threading
 import time
+import traceback
 from typing import Any, Self
 
 from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 from tap_ros.base.errors import TapError
+from tap_ros.base.text import escaped
 from tap_ros.ros.heartbeat import Liveness
-from tap_ros.ros.services import log_error, wait_for_some
-from tap_ros.ros.subscriptions import PollOnlyGroup
 
 POLL_S = 0.05  # between two looks at whether a server is still there
+DRAIN_S = 0.2  # that what was sent before may take to arrive
 
 
 class CallError(TapError):
     """A service, action or topic did not answer in time, or refused."""
+
+
+def log_error(node: Node, what: str, error: BaseException) -> None:
+    """Log an error in one line; an unexpected one, that is no TapError, with its traceback."""
+    lines = [escaped(error, 1000)] if isinstance(error, TapError) else [
+        escaped(line) for line in ''.join(traceback.format_exception(error)).splitlines()]
+    for line in lines:
+        node.get_logger().error(f'{what}: {line}')
+
+
+def reason(node: Node, what: str, error: Exception) -> str:
+    """Return why something failed, for whoever asked for it; log what was not expected."""
+    if isinstance(error, TapError):
+        return str(error)
+    log_error(node, what, error)
+    return f'internal error: {type(error).__name__}: {escaped(error)}'
+
+
+def answering(node: Node, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """
+    Wrap the callback of a service so that any exception becomes a refusal with its reason.
+
+    :param callback: function or coroutine function.
+    """
+    async def answer(request: Any, response: Any) -> Any:
+        try:
+            found = callback(request, response)
+            return await found if inspect.isawaitable(found) else found
+        except Exception as error:
+            return type(response)(success=False, message=reason(node, 'service', error))
+
+    return answer
+
+
+def spin_once(executor: Executor, node: Node, timeout_s: float = 0.1) -> None:
+    """Run what is ready, within the time; a callback that raises is logged, and ends no node."""
+    try:
+        executor.spin_once(timeout_sec=timeout_s)
+    except ExternalShutdownException:
+        raise
+    except InvalidHandle:  # of what another thread destroyed just now
+        pass
+    except Exception as error:
+        log_error(node, 'a callback failed; the node goes on', error)
+
+
+def drain(node: Node) -> None:
+    """Run the callbacks of what came before a node ends, once its executor has stopped."""
+    deadline = time.monotonic() + DRAIN_S
+    while node.executor and node.context.ok() and (left := deadline - time.monotonic()) > 0:
+        spin_once(node.executor, node, left)
 
 
 class Spinner:
@@ -33,56 +85,32 @@ class Spinner:
     A thread that keeps spinning answers ten times faster than spinning once per call.
 
     :param node: rclpy Node; destroying it stays with the caller.
-    :ivar answers: callback group for service clients: another thread takes their answers, without
-        the executor, which looks at everything that the node has, three times for an answer.
     """
 
     def __init__(self, node: Node) -> None:
-        self._node, self.answers = node, PollOnlyGroup()
+        self._node, self._stop = node, threading.Event()
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._stop = threading.Event()
-        spin = partial(self._executor.spin_once, timeout_sec=0.1)
-        self._threads = [
-            threading.Thread(target=self._repeat, args=(do,), name=name, daemon=True)
-            for do, name in ((spin, 'spinner'), (self._take_answers, 'answers'))]
+        self._thread = threading.Thread(target=self._run, name='spinner', daemon=True)
 
     def __enter__(self) -> Self:
-        for thread in self._threads:
-            thread.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        for thread in self._threads:
-            thread.join(timeout=5.0)
+        self._executor.wake()
+        self._thread.join(timeout=5.0)
         self._executor.shutdown(timeout_sec=1.0)
 
-    def _repeat(self, do: Callable[[], object]) -> None:
-        """Do something until the end, whatever it raises: a node whose thread ends is deaf."""
-        while not self._stop.is_set():
-            try:
-                do()
-            except (InvalidHandle, ExternalShutdownException):
-                self._stop.wait(0.001)  # another thread has destroyed something just now
-            except Exception as error:
-                log_error(self._node, 'a callback failed; the node goes on', error)
-
-    def _take_answers(self) -> None:
-        clients = [one for one in self._node.clients if one.callback_group is self.answers]
-        if not clients:
-            self._stop.wait(POLL_S)
-            return
-        for client in wait_for_some(self._node.context, clients):
-            header, answer = client.handle.take_response(client.srv_type.Response)
-            if header is not None:
-                with suppress(KeyError):  # given up
-                    client.get_pending_request(
-                        header.request_id.sequence_number).set_result(answer)
+    def _run(self) -> None:
+        with suppress(ExternalShutdownException):
+            while not self._stop.is_set():
+                spin_once(self._executor, self._node)
 
 
 def call(client: Client, request: Any, timeout_s: float,
-         give_up: Callable[[], bool] = lambda: False, server: Liveness | None = None) -> Any:
+         give_up: Callable[[], object] = lambda: False, server: Liveness | None = None) -> Any:
     """
     Call a service from a thread that does not spin the node.
 
@@ -118,7 +146,7 @@ def call(client: Client, request: Any, timeout_s: float,
 
 
 def wait_for_answer(future: Future, deadline: float, left: str, gone: Callable[[], bool],
-                    give_up: Callable[[], bool] = lambda: False) -> bool:
+                    give_up: Callable[[], object] = lambda: False) -> bool:
     """
     Wait for what a server answers, however long it is silent.
 

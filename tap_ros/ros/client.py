@@ -38,9 +38,8 @@ from tap_ros.ros.calls import call, CallError, Spinner
 from tap_ros.ros.heartbeat import Liveness
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.reaching import CANCEL, CLIENT, Goals, Reaching
-from tap_ros.ros.ros_messages import encode_image, encode_objects
 from tap_ros.ros.run import configure_fast_dds
-from tap_ros.ros.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
+from tap_ros.ros.topics import encode_image, encode_objects, LATCHED, SERVICE_QOS, STREAM, to_stamp
 
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
@@ -96,7 +95,6 @@ class Client:
     :param namespace: of the nodes.
     :param timeout_s: most seconds of a call that is given no other time-out.
     :param node: rclpy Node that another thread spins, to use instead of one of its own.
-    :ivar answers: callback group of service clients.
     """
 
     def __init__(self, namespace: str = '', timeout_s: float = 20.0,
@@ -119,7 +117,6 @@ class Client:
             self._spinner.__enter__()
         self.node = node
         self._group = ReentrantCallbackGroup()
-        self.answers = self._group if self._context is None else self._spinner.answers
         self._lock = threading.RLock()
         self._made: dict[str, Any] = {}  # what was asked for so far
         atexit.register(self.close)  # a goal has an owner, and threads end before Python does
@@ -152,6 +149,10 @@ class Client:
         silence: str = self._liveness(name).silence
         return silence
 
+    def find(self, service: str) -> None:
+        """Look for one of SERVICES, and hear its node's heartbeat, from now on."""
+        self._service(service)
+
     def wait_until_ready(self, *names: str, timeout_s: float = 90.0) -> None:
         """
         Wait until nodes are ready.
@@ -169,7 +170,7 @@ class Client:
             time.sleep(0.1)
 
     def call(self, service: str, timeout_s: float | None = None,
-             give_up: Callable[[], bool] = lambda: False, **fields: Any) -> Any:
+             give_up: Callable[[], object] = lambda: False, **fields: Any) -> Any:
         """
         Call a service with messages, as they are in ROS.
 
@@ -342,13 +343,13 @@ class Client:
         kind, topic, server = SERVICES[name]
         self._liveness(server)  # its heartbeat is heard from now on
         return self._once(topic, lambda: self.node.create_client(
-            kind, topic, qos_profile=SERVICE_QOS, callback_group=self.answers))
+            kind, topic, qos_profile=SERVICE_QOS, callback_group=self._group))
 
     @property
     def goals(self) -> Goals:
         """What sends goals."""
         made: Goals = self._once('goals', lambda: Goals(
-            self.node, self._liveness(PLANNER), self._group, self.answers))
+            self.node, self._liveness(PLANNER), self._group))
         return made
 
     def _liveness(self, name: str) -> Any:

@@ -24,6 +24,7 @@ from tap_ros.base.text import listing
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
 
 FARTHEST = 100.0  # m; no camera is there
+OF_RCLPY = {'use_sim_time', 'start_type_description_service'}  # parameters of any node
 # Of several nodes: default, description, and what else Parameters.declare takes.
 SHARED: dict[str, tuple[Any, str, dict[str, Any]]] = {
     'autostart': (
@@ -50,10 +51,15 @@ class Parameters:
     The parameters of one node: declare each once, then read them by name.
 
     :param node: rclpy Node.
+    :ivar given: names of those that were given at the start, where rclpy has declared them for
+        that; they are declared anew, as the node has them.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self.given = set(node.list_parameters([], 0).names) - OF_RCLPY
+        for name in self.given:
+            node.undeclare_parameter(name)
         self._choices: dict[str, tuple[str, ...]] = {}
         node.add_on_set_parameters_callback(self._check_choices)
 
@@ -61,8 +67,8 @@ class Parameters:
         """Return the present value."""
         return self._node.get_parameter(name).value
 
-    def declare(self, name: str, default: Any, description: str, low: float | None = None,
-                high: float | None = None, choices: Sequence[str] | None = None,
+    def declare(self, name: str, default: Any, description: str,
+                between: tuple[float, float] | None = None, choices: Sequence[str] | None = None,
                 read_only: bool = True) -> Any:
         """
         Declare one parameter and return its value.
@@ -70,18 +76,18 @@ class Parameters:
         :param name: name of the parameter.
         :param default: its value unless one is given at the start; also sets the type.
         :param description: one sentence with the unit.
-        :param low: smallest value of a number; goes with `high`.
-        :param high: largest value of a number.
+        :param between: smallest and largest value of a number.
         :param choices: the only values of a string.
         :param read_only: False if a running node heeds a change.
         :return: the value.
         :raises ConfigError: when the value given at the start is of another type or out of range.
         """
         descriptor = ParameterDescriptor(description=description, read_only=read_only)
-        if low is not None and high is not None and isinstance(default, float):
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(low), to_value=float(high))]
-        elif low is not None:
+        if between is not None and isinstance(default, float):
+            low, high = map(float, between)
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        elif between is not None:
+            low, high = map(int, between)
             descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
         if choices is not None:
             self._choices[name] = tuple(choices)
@@ -107,7 +113,7 @@ class Parameters:
         self.declare_mount(arm)
         self.declare('fixed_opening', 0.0,
                      'Opening of the gripper, 0 to 1, where no joint_states has '
-                     'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
+                     'gripper_opening; 0 is closed, as for pushing.', between=(0.0, 1.0))
 
     def declare_mount(self, arm: str) -> None:
         """Declare the place of an arm; by default at the simulated table."""
@@ -115,23 +121,23 @@ class Parameters:
         for axis, value in zip('xyz', default.position):
             self.declare(
                 f'mount_{axis}', value, f'{axis} of the base of the arm in the world, m; of its '
-                'controller\'s frame "base".', low=-10.0, high=10.0)
+                'controller\'s frame "base".', between=(-10.0, 10.0))
         self.declare('mount_turn', default.yaw,
                      'Turn of that frame about the vertical, rad; the base stands upright.',
-                     low=-2 * math.pi, high=2 * math.pi)
+                     between=(-2 * math.pi, 2 * math.pi))
         self.declare('tool_length', default.tool,
-                     'From the flange to the fingertips along its z, m.', low=0.0, high=2.0)
+                     'From the flange to the fingertips along its z, m.', between=(0.0, 2.0))
 
     def declare_camera(self, frame: str) -> None:
         """Declare the pose of the camera in a frame, and what counts of its camera_info."""
         for axis in 'xyz':
             self.declare(f'camera_{axis}', 0.0, f'{axis} of the camera in {frame}, m.',
-                         low=-FARTHEST, high=FARTHEST)
+                         between=(-FARTHEST, FARTHEST))
         for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
             self.declare(
                 f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
                 f'optical frame (z forward, x right, y down in the picture) into {frame}.',
-                low=-1.0, high=1.0)
+                between=(-1.0, 1.0))
         self.declare('rectified', False,
                      'The pictures are rectified: P of camera_info counts, else K.')
 
@@ -151,8 +157,8 @@ class Parameters:
     def _check_choices(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse strings that are none of the choices."""
         for parameter in parameters:
-            choices = self._choices.get(parameter.name)
-            if choices is not None and parameter.value not in choices:
+            choices = self._choices.get(parameter.name, (parameter.value,))
+            if parameter.value not in choices:
                 return SetParametersResult(
                     successful=False,
                     reason=f'{parameter.name} is {parameter.value!r}; '

@@ -3,7 +3,6 @@
 """Laws of putting messages together by their stamp."""
 
 from itertools import product
-from math import inf
 import threading
 import time
 
@@ -16,8 +15,7 @@ from sensor_msgs.msg import CompressedImage, Image, JointState
 from tap_msgs.msg import ObjectStates
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
-from tap_ros.ros.ros_messages import encode_objects
-from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.topics import encode_objects, LATCHED, STREAM, to_stamp
 
 
 def stamped(kind, nanoseconds):
@@ -122,7 +120,7 @@ def test_what_repeats_a_stamp_is_as_old_as_the_first_unless_a_clock_says_that_ti
     for stray in range(100, 100 + 3 * DEPTH):
         seen.put('joints', stamped(Image, stray), 3.6)
     receive(10, 3.7)  # long forgotten by its stamp
-    assert seen.ages(('image', 'other'), 4.0) == {'image': 3.0, 'other': inf}
+    assert seen.ages(('image',), 4.0) == {'image': 3.0}
     seen.on_clock(Clock(clock=to_stamp(10)))
     receive(10, 3.9)
     assert seen.newest('image', since=3.8).received == 3.9
@@ -142,12 +140,10 @@ def test_time_in_a_queue_makes_a_message_older():
                for stamp in (0, time.time_ns() + 10**12)) >= now
 
 
-def test_topics_are_put_together_as_they_come_or_on_demand(client):
+def test_topics_are_put_together_as_they_come(client):
     types = {'image': (Image, 'eye/image'), 'joints': (JointState, 'arm/joints')}
     seen, told = Observations('image', 'joints'), []
     seen.subscribe(client, types, STREAM, on_message=told.append)
-    asked, taken = Observations('image', 'joints'), []
-    asked.subscribe(client, types, STREAM, on_message=taken.append, on_demand=True)
     publishers = [client.create_publisher(kind, name, STREAM) for kind, name in types.values()]
     begun = time.monotonic()
     for stamp in range(1, 600):
@@ -159,8 +155,7 @@ def test_topics_are_put_together_as_they_come_or_on_demand(client):
     assert begun <= moment.received <= time.monotonic()
     assert {topic: type(message) for topic, message in moment.messages.items()} == {
         'image': Image, 'joints': JointState}
-    assert set(told) == {'eye/image', 'arm/joints'} and not taken
-    assert asked.wait(('image', 'joints'), 5) and set(taken) == set(told)
+    assert set(told) == {'eye/image', 'arm/joints'}
 
 
 def test_waiting_ends_with_the_message_with_giving_up_and_with_the_time():
@@ -184,15 +179,14 @@ def objects(stamp, u=3.0, v=8.0):
                           ObjectStates.SOURCE_TRACKED)
 
 
-@pytest.mark.parametrize('on_demand', [False, True])
-def test_best_effort_and_volatile_publishers_are_heard(client, on_demand):
+def test_best_effort_and_volatile_publishers_are_heard(client):
     heard = []
     camera, goal = Observations('image'), Observations('image', 'objects', latched=True)
     for seen, types, qos in (
             (camera, {'image': (CompressedImage, 'camera/image_raw/compressed')}, STREAM),
             (goal, {'image': (CompressedImage, 'goal/image/compressed'),
                     'objects': (ObjectStates, 'goal/objects')}, LATCHED)):
-        seen.subscribe(client, types, qos, on_message=heard.append, on_demand=on_demand)
+        seen.subscribe(client, types, qos, on_message=heard.append)
     with Client('camera') as node:
         volatile = QoSProfile(depth=1)  # of a goal, as `ros2 topic pub` has it
         sends = [(node.create_publisher(type(message), topic, qos), message)
@@ -212,19 +206,17 @@ def test_what_was_latched_before_does_not_come_back(client):
     """A goal by hand, volatile, is not undone when its publisher has left."""
     kept = client.create_publisher(ObjectStates, 'goal/objects', LATCHED)
     kept.publish(objects(3 * 10**9, 3.0))
-    asked, observed = (Observations('objects', latched=True) for _ in range(2))
-    for observations, on_demand in ((asked, True), (observed, False)):
-        observations.subscribe(client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED,
-                               on_demand=on_demand)
+    observed = Observations('objects', latched=True)
+    observed.subscribe(client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED)
 
     def newest():
-        found = [each.newest('objects') for each in (asked, observed)]
-        return [one and one.messages['objects'].objects[0].u for one in found]
+        found = observed.newest('objects')
+        return found and found.messages['objects'].objects[0].u
 
-    assert until(lambda: newest() == [3, 3])
+    assert until(lambda: newest() == 3)
     by_hand = client.create_publisher(ObjectStates, 'goal/objects', QoSProfile(depth=1))
-    assert until(lambda: by_hand.publish(objects(5 * 10**9, 5.0)) or newest() == [5, 5],
+    assert until(lambda: by_hand.publish(objects(5 * 10**9, 5.0)) or newest() == 5,
                  pause=0.2)
     client.destroy_publisher(by_hand)
     # Longer than it takes to look at what is offered.
-    assert not until(lambda: newest() != [5, 5], 2, pause=0.1)
+    assert not until(lambda: newest() != 5, 2, pause=0.1)

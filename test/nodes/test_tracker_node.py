@@ -23,8 +23,14 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.tracker.node import TrackerNode
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.client import positions_of
-from tap_ros.ros.ros_messages import encode_camera_info, encode_image, encode_joints
-from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.topics import (
+    encode_camera_info,
+    encode_image,
+    encode_joints,
+    LATCHED,
+    STREAM,
+    to_stamp,
+)
 from websockets.sync.client import connect
 
 SIZE = 128

@@ -145,7 +145,7 @@ def compare_latency(stream, rounds, calls):
     :return: Latency.
     """
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
-    request = Request(*pictures(), *PIXELS)
+    alike = Request(*pictures(), *PIXELS)
     alone, together, service, inside = [], [], [], []
     with Client() as client:
         ask, request = make_client(client, SERVICE_QOS.depth), make_request()
@@ -154,8 +154,8 @@ def compare_latency(stream, rounds, calls):
         call(ask, request, 120)
         for _ in range(rounds):
             os.kill(stream.pid, signal.SIGSTOP)
-            alone += timed(lambda: predictor.predict_together([request]), calls)
-            together += timed(lambda: predictor.predict_together([request] * TOGETHER),
+            alone += timed(lambda: predictor.predict_together([alike]), calls)
+            together += timed(lambda: predictor.predict_together([alike] * TOGETHER),
                               -(-calls // TOGETHER))
             os.kill(stream.pid, signal.SIGCONT)
             service += timed(lambda: inside.append(
@@ -246,8 +246,7 @@ def ask_many(clients, seconds, depth, barrier, results):
 def make_client(client, depth):
     """Return a further rclpy client of the predictor, with a queue of its own."""
     return client.node.create_client(
-        PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth),
-        callback_group=client.answers)
+        PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth))
 
 
 @contextlib.contextmanager

@@ -49,11 +49,11 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
     parameters.declare('control_period', CONTROL_PERIOD,
                        'Seconds (of image stamps) that the arm takes for one command.',
-                       low=0.01, high=10.0)
+                       between=(0.01, 10.0))
     parameters.declare('twist_scale', 1.0,
                        'Factor of what is sent: 1 for metres per control period, '
                        '1 / control_period for metres per second as MoveIt Servo takes them.',
-                       low=0.001, high=1000.0)
+                       between=(0.001, 1000.0))
     parameters.declare('stamp_with_now', False,
                        'Stamp commands with the time of sending, as MoveIt Servo wants them, '
                        'instead of the stamp of the image that they answer.')
@@ -66,31 +66,31 @@ def declare_parameters(node: Node) -> Parameters:
             ('goal_tolerance', GOAL_TOLERANCE, 0.0, 64.0,
              'A goal is reached at this mean distance of the objects in pixels, a subgoal where '
              'the mean expected distance to its maps is so much above the least possible.')):
-        parameters.declare(name, default, description, low=low, high=high, read_only=False)
+        parameters.declare(name, default, description, between=(low, high), read_only=False)
     parameters.declare('switch', 'reached', 'When to go on from a subgoal: when it is reached, '
                        'or its share of the budget spent; or (half) then alone, as in the paper.',
                        choices=SWITCHES, read_only=False)
     parameters.declare('subgoal_rounds', 1, 'How often a goal in subgoal mode asks for subgoals: '
                        'again, from what is seen then, when those of a round are passed.',
-                       low=1, high=16, read_only=False)
+                       between=(1, 16), read_only=False)
     parameters.declare('max_silence', 0.35,
                        'The arm is stopped when the picture, the objects or the joints have been '
                        'silent for so many seconds, or when the last command is so old. Has to '
                        'be longer than the time from one picture to the next.',
-                       low=0.05, high=60.0, read_only=False)
+                       between=(0.05, 60.0), read_only=False)
     parameters.declare('command_timeout', 0.5,
                        'Seconds that a command is valid after it came; told to the arm on '
-                       'arm/command_timeout.', low=0.01, high=60.0)
+                       'arm/command_timeout.', between=(0.01, 60.0))
     parameters.declare('max_age', 3.0,
                        'Seconds; what was received longer ago is not acted upon. A plan ends in '
                        'time for that, if need be with fewer samples; in lock-step nothing ages.',
-                       low=0.1, high=600.0, read_only=False)
+                       between=(0.1, 600.0), read_only=False)
     parameters.declare_arm()
     parameters.declare('image_timeout', 5.0,
                        'Seconds without a usable observation after which a goal is aborted.',
-                       low=0.1, high=600.0, read_only=False)
+                       between=(0.1, 600.0), read_only=False)
     parameters.declare('predictor_timeout', 20.0, 'Seconds to wait for a subgoal.',
-                       low=0.1, high=600.0, read_only=False)
+                       between=(0.1, 600.0), read_only=False)
     return parameters
 
 

@@ -4,12 +4,15 @@
 
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 import time
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.task import Future
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
@@ -20,18 +23,16 @@ from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.predictor import requests
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
-from tap_ros.ros import services
+from tap_ros.ros.calls import drain, log_error, reason
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.lifecycle import LifecycleBase
 from tap_ros.ros.parameters import check_device, Parameters
 from tap_ros.ros.robot_view import warn_if_unlike
-from tap_ros.ros.ros_messages import encode_image
 from tap_ros.ros.subscriptions import steady_timer
-from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED
+from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, LATCHED, SERVICE_QOS
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
-Send = Callable[[PredictSubgoal.Response], object]
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 SHOW_PERIOD = 0.1  # s between two checks for a subgoal to publish
@@ -42,8 +43,8 @@ class PredictorNode(LifecycleBase):
     Offers the service only once the weights are loaded, checked and warmed up.
 
     Without autostart it offers the service at once, and refuses requests until it is active. One
-    thread takes and checks the requests; another predicts what waits together, and sends the
-    answers.
+    thread checks and decodes the requests, another predicts what waits together; the executor
+    takes messages meanwhile, and sends the answers.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -58,6 +59,7 @@ class PredictorNode(LifecycleBase):
             [name for _, name in goal.values()],
             queue=lambda: len(self._queue or ()), idle=self.why_not)
         self._reader = requests.RequestReader(self, self.params, self._diagnostics.received)
+        self._reading = ThreadPoolExecutor(1, 'reading')
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
@@ -65,16 +67,16 @@ class PredictorNode(LifecycleBase):
         self._unshown: deque[
             tuple[requests.PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
         steady_timer(self, SHOW_PERIOD, self._on_timer)
-        self._service = services.DeferredService(
-            self, PredictSubgoal, 'predict_subgoal', self._on_request)
         self.autostart('activate')
-        self._service.start()
+        self.create_service(PredictSubgoal, 'predict_subgoal', self._on_request,
+                            qos_profile=SERVICE_QOS, callback_group=ReentrantCallbackGroup())
 
     def close(self) -> None:
         """Refuse all waiting requests, and let the running batch end."""
         if self._queue is not None:
             self._queue.close()
-        self._service.close()  # what waits is refused: the node is ending
+        drain(self)  # what waits is refused: the node is ending
+        self._reading.shutdown()
         self._show()
 
     # Lifecycle
@@ -107,26 +109,19 @@ class PredictorNode(LifecycleBase):
         """Return the file of the weights."""
         return predictor_files(self.params['weights'])
 
-    # In the thread of the service
-
-    def _on_request(self, request: PredictSubgoal.Request, send: Send) -> None:
-        """Check a request and put it into the queue, or refuse it."""
-        begin = time.perf_counter()
-        queue, predictor = self._queue, self._predictor
-        try:
-            if not self.active or queue is None or predictor is None:
-                raise ConfigError(self.why_not())
-            task = self._reader.read(request, predictor)
-            queue.put(task, lambda found: self._answer(task, found, send, begin))
-        except Exception as error:
-            self._send(send, self._refusal(error))
-
     # In the executor
 
+    async def _on_request(self, request: PredictSubgoal.Request,
+                          _: PredictSubgoal.Response) -> PredictSubgoal.Response:
+        """Answer a request once that is predicted; other callbacks run meanwhile."""
+        answer: Future = Future()
+        self._reading.submit(self._read, request, answer, time.perf_counter())
+        response: PredictSubgoal.Response = await answer
+        return response
+
     def _on_timer(self) -> None:
-        """Publish a new subgoal, and take messages so that diagnostics have their age and rate."""
         self._show()
-        self._reader.poll()
+        self._reader.look()
 
     def _show(self) -> None:
         """Publish the newest subgoal, for planners and people, if it is not published yet."""
@@ -142,13 +137,26 @@ class PredictorNode(LifecycleBase):
             self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
         except Exception as error:
             self._diagnostics.error(error)
-            services.log_error(self, 'subgoal', error)
+            log_error(self, 'subgoal', error)
+
+    # In the thread that reads
+
+    def _read(self, request: PredictSubgoal.Request, answer: Future, begin: float) -> None:
+        """Check a request that came at time `begin` and put it into the queue, or refuse it."""
+        queue, predictor = self._queue, self._predictor
+        try:
+            if not self.active or queue is None or predictor is None:
+                raise ConfigError(self.why_not())
+            task = self._reader.read(request, predictor)
+            queue.put(task, lambda found: self._answer(task, found, answer, begin))
+        except Exception as error:
+            self._send(answer, self._refusal(error))
 
     # In the thread of the queue
 
-    def _answer(self, task: requests.PendingRequest, found: Found | Exception, send: Send,
+    def _answer(self, task: requests.PendingRequest, found: Found | Exception, answer: Future,
                 begin: float) -> None:
-        """Send the response to a task that was received at time `begin`."""
+        """Encode the response to a task that came at time `begin`."""
         try:
             if isinstance(found, Exception):
                 raise found
@@ -156,15 +164,15 @@ class PredictorNode(LifecycleBase):
             # Where to go first: the earliest subgoal of the first sample.
             shown = task, found[0][0], response.subgoals[0]
         except Exception as error:
-            self._send(send, self._refusal(error))
+            self._send(answer, self._refusal(error))
             return
-        self._send(send, response)
+        self._send(answer, response)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         self._unshown.append(shown)
 
     # In any of them
 
-    def _refusal(self, error: Exception) -> Any:
+    def _refusal(self, error: Exception) -> PredictSubgoal.Response:
         """Return the response that names an error, and log it."""
         if isinstance(error, Busy):
             self.get_logger().warning(f'predict_subgoal: {error}', throttle_duration_sec=1.0)
@@ -173,14 +181,13 @@ class PredictorNode(LifecycleBase):
         else:
             self._diagnostics.error(error)
         return PredictSubgoal.Response(
-            success=False, message=services.reason(self, 'predict_subgoal', error))
+            success=False, message=reason(self, 'predict_subgoal', error))
 
-    def _send(self, send: Send, response: PredictSubgoal.Response) -> None:
-        """Send a response; its client may have gone."""
-        try:
-            send(response)
-        except Exception as error:
-            services.log_error(self, 'predict_subgoal: a response cannot be sent', error)
+    def _send(self, answer: Future, response: PredictSubgoal.Response) -> None:
+        """Have the executor send a response."""
+        answer.set_result(response)
+        if self.executor is not None:
+            self.executor.wake()
 
 
 def predict(predictor: Predictor, tasks: list[requests.PendingRequest]) -> list[Found]:

@@ -8,8 +8,10 @@ from pathlib import Path
 import time
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tap_ros.base.errors import ConfigError, RecordingError, StorageError
 from tap_ros.base.files import free_folder
@@ -17,12 +19,11 @@ from tap_ros.base.text import escaped
 from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
 from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.recording.writer import BagWriter
+from tap_ros.ros.calls import answering, drain, DRAIN_S
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.parameters import declared_mount, Parameters
-from tap_ros.ros.ros_messages import message_class
-from tap_ros.ros.services import answering
 from tap_ros.ros.subscriptions import AdaptiveSubscription, steady_timer
-from tap_ros.ros.topics import camera_image, SERVICE_QOS
+from tap_ros.ros.topics import camera_image, message_class, SERVICE_QOS
 
 DEPTH = 100  # messages that may wait while the disk is slow
 TRANSIENT_LOCAL = DurabilityPolicy.TRANSIENT_LOCAL
@@ -173,13 +174,13 @@ class RecorderNode(Node):
         streams = {name for name in self._wanted if (known := _known(name)) and known.periodic}
         self._diagnostics = Diagnostics(
             self, streams, set(self._wanted) - streams,
-            expected=self._wanted if 'topics' in self._parameter_overrides else ())
+            expected=self._wanted if self.params['topics'] != [*BY_NAME] else ())
         self._bags = Bags(self.params, self._report)
         if self.params['record_on_start']:
             self._bags.start()
         self._subscribe_known()
         self.create_service(SetBool, 'recorder/record', answering(self, self._on_record),
-                            qos_profile=SERVICE_QOS)
+                            qos_profile=SERVICE_QOS, callback_group=ReentrantCallbackGroup())
         steady_timer(self, 0.5, self._on_timer)
         self.get_logger().info(
             f'ready: recording to {escaped(self._bags.folder)}' if self._bags.folder
@@ -187,20 +188,24 @@ class RecorderNode(Node):
 
     def close(self) -> int:
         """Finish the bag; return the exit code, 1 when the last bag is incomplete."""
+        drain(self)  # what has arrived, such as the end of an episode, is recorded
         self._finish()
         return int(self._bags.failure is not None)
 
     def _finish(self) -> str:
-        """Record what has arrived, such as the end of an episode, and finish the bag."""
-        for subscription in self._recorded.values():
-            for message, info in subscription.take(DEPTH):
-                subscription.subscription.callback(message, info)
+        """Finish the bag; return a report for people."""
         recorded, text = self._bags.folder, self._bags.finish()
         if recorded and self._bags.failure is None:
             self.get_logger().info(f'recorded {text}')
         return text
 
-    def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    async def _on_record(self, request: SetBool.Request,
+                         response: SetBool.Response) -> SetBool.Response:
+        if not request.data:  # what was sent before is recorded
+            arrived: Future = Future()
+            timer = steady_timer(self, DRAIN_S, lambda: arrived.set_result(None))
+            await arrived
+            self.destroy_timer(timer)
         response.message = (f'recording to {escaped(self._bags.start())}' if request.data
                             else self._finish())
         response.success = self._bags.failure is None

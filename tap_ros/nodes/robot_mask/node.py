@@ -22,18 +22,18 @@ from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
 from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
+from tap_ros.ros.calls import log_error
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
 from tap_ros.ros.parameters import declared_mount, Parameters
-from tap_ros.ros.ros_messages import encode_mask
-from tap_ros.ros.services import log_error
 from tap_ros.ros.subscriptions import (
     adapt_regularly,
     AdaptiveSubscription,
+    publishers_of,
     rivals,
     steady_timer,
 )
-from tap_ros.ros.topics import LATCHED, STREAM
+from tap_ros.ros.topics import encode_mask, LATCHED, STREAM
 
 WAITING = 100  # pictures that may wait for their joint states
 
@@ -140,7 +140,7 @@ class RobotMaskNode(Node):
         :raises ImageError: for a camera that cannot be used.
         """
         begin, robot = time.perf_counter(), self._robot
-        cameras = rivals(self, ['camera/camera_info'])
+        cameras = rivals(publishers_of(self, 'camera/camera_info'))
         if cameras:
             raise ImageError(f'{cameras}; leave one of them')
         if robot is None:
@@ -178,25 +178,25 @@ def declare_parameters(node: Node) -> Parameters:
                        'with a named arm its own.')
     parameters.declare('hand_radius', 0.06,
                        'With a named arm: radius of a cylinder around the hand, from the flange '
-                       'to the fingertips, m.', low=0.001, high=1.0)
+                       'to the fingertips, m.', between=(0.001, 1.0))
     parameters.declare_camera('base_frame')
     parameters.declare('base_frame', '',
                        'Link of the robot in which the pose of the camera is given; empty: its '
                        'root.')
     parameters.declare('dilation', 1.0,
                        'Pixels by which the mask is larger than the shapes on all sides.',
-                       low=0.0, high=100.0, read_only=False)
+                       between=(0.0, 100.0), read_only=False)
     parameters.declare('shadow', False,
                        'Mark the shadow on the table, too, as of one light from afar.')
     parameters.declare('table_height', 0.0, 'z of the table in base_frame, m.',
-                       low=-10.0, high=10.0)
+                       between=(-10.0, 10.0))
     for axis, value in zip('xyz', (0.0, 0.0, -1.0)):
         parameters.declare(f'light_{axis}', value,
                            f'{axis} of the direction in which the light shines, in base_frame.',
-                           low=-100.0, high=100.0)
+                           between=(-100.0, 100.0))
     parameters.declare('max_silence', 0.35,
                        'Seconds; a picture without joint states nearer to it than this gets no '
-                       'mask.', low=0.05, high=60.0, read_only=False)
+                       'mask.', between=(0.05, 60.0), read_only=False)
     named = parameters['urdf'] in names('tap_ros.arms')
     parameters.declare_mount(parameters['urdf'] if named else DEFAULT_ARM)
     return parameters

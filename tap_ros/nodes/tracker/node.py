@@ -27,18 +27,24 @@ from tap_ros.messages.objects import decode_objects, MAX_OBJECTS
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE, JOINT_STATES
 from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.ros.calls import answering, log_error
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import JUMP_NS, Moment, Observations, reception_time
 from tap_ros.ros.parameters import declared_arm, Parameters, pose_matrix
-from tap_ros.ros.ros_messages import encode_objects
-from tap_ros.ros.services import answering, log_error
 from tap_ros.ros.subscriptions import (
     adapt_regularly,
     AdaptiveSubscription,
     publishers_of,
     rivals,
 )
-from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, SERVICE_QOS, STREAM
+from tap_ros.ros.topics import (
+    camera_topics,
+    encode_objects,
+    goal_topics,
+    LATCHED,
+    SERVICE_QOS,
+    STREAM,
+)
 from tap_ros.tracking.plane import check_pose, MIDDLE, Plane
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, Tracker, View
 from tap_ros.tracking.registration import propose
@@ -88,7 +94,7 @@ class TrackerNode(Node):
         self._gripper = GripperHistory(
             declared_arm(self.params), self.params['joint_prefix'], self.params['fixed_opening'])
         camera = camera_topics(self.params)
-        self._own_topics = [camera['image'][1]]  # another camera sends pictures
+        self._image_topic = camera['image'][1]  # another camera sends pictures
         del camera['objects']
         goal = goal_topics(self.params['robot_mask'])
         del goal['objects']
@@ -180,7 +186,7 @@ class TrackerNode(Node):
         :raises TapError: for names or clicks that cannot be used; then nothing changes.
         """
         found, clicks = self._asked(request, view.image.shape[:2])
-        cameras = rivals(self, self._own_topics)
+        cameras = rivals(publishers_of(self, self._image_topic))
         if cameras:
             raise TrackingError(f'{cameras}; leave one of them')
         others = self.count_publishers('objects') - 1
@@ -193,7 +199,7 @@ class TrackerNode(Node):
         message = self._encode(found, tracked, plane, moment.messages['image'].header)
         self._selection = Selection(
             found, tracker, plane, view.image.shape[:2], moment.stamp_ns, self._sensors.jumps,
-            publishers_of(self, self._own_topics), moment.stamp_ns, moment.received,
+            publishers_of(self, self._image_topic), moment.stamp_ns, moment.received,
             tracked, message)
         self._objects.publish(message)
         self._sensors.wake()  # for the goal
@@ -406,7 +412,7 @@ class TrackerNode(Node):
         """Say in what way the camera shows another scene than that of a selection, '' if not."""
         if self._sensors.jumps != selection.jumps:
             return 'the clock of its pictures has jumped: another camera, simulator or recording'
-        return rivals(self, self._own_topics, selection.publishers)
+        return rivals(publishers_of(self, self._image_topic), selection.publishers)
 
     def _other_camera(self, selection: Selection, size: tuple[int, int]) -> str:
         """Say how pictures of a size differ from those of a selection, '' if they do not."""
@@ -475,7 +481,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare_arm()
     parameters.declare('max_silence', 0.35,
                        'Seconds; of a picture without joint states nearer to it than this the '
-                       'gripper is not known.', low=0.05, high=60.0, read_only=False)
+                       'gripper is not known.', between=(0.05, 60.0), read_only=False)
     parameters.declare('patience', 0.1, 'Seconds that the joints of a picture, or the robot mask '
-                       'of a goal, are waited for.', low=0.0, high=60.0)
+                       'of a goal, are waited for.', between=(0.0, 60.0))
     return parameters
