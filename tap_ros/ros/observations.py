@@ -18,12 +18,15 @@ from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.ros.subscriptions import adapt_regularly, AdaptiveSubscription
+from tap_ros.ros.polling import PollOnlyGroup, take_messages
+from tap_ros.ros.subscriptions import ADAPT_PERIOD, adapt_regularly, AdaptiveSubscription
 
 DEPTH = 10  # stamps remembered
 JUMP_NS = 10 * 10**9  # a stamp that far ahead of all others is not believed at once
 REMEMBERED = 100  # messages of a latched topic by which repetitions are recognised
 PROOF = 3  # messages in a row that prove that the clock of a topic has jumped
+POLL_LIMIT = 100  # messages of a topic taken by one poll; the rest comes with the next
+POLL_S = 0.005  # between two polls while waiting
 CLOCK_S = 1.0  # s after which nothing is known of a clock or driver that is silent
 
 
@@ -75,6 +78,8 @@ class Observations:
         self._by_stamp: OrderedDict[int, dict[str, tuple[Any, float]]] = OrderedDict()
         self._clock = -1, -math.inf, False  # ns, when it came, whether it said the same before
         self.count, self.jumps = 0, 0
+        self._polled: list[AdaptiveSubscription] = []
+        self._adapted = -math.inf  # monotonic time at which these were
         self._subscriptions: dict[str, AdaptiveSubscription] = {}
 
     def subscribe(self, node: Node, types: Mapping[str, tuple[type, str]], qos: QoSProfile,
@@ -86,10 +91,13 @@ class Observations:
 
         :param types: {short name: (message type, topic name)}.
         :param qos: QoSProfile of all of them.
-        :param callback_group: callback group, None for the node's own.
+        :param callback_group: None for the node's own. PollOnlyGroup: messages are taken only when
+            something is asked of this object, as many as `qos` keeps.
         :param on_message: called with the topic name after each message.
         :param others: {short name: callback that takes message and info instead of `put`}.
         """
+        on_demand = isinstance(callback_group, PollOnlyGroup)
+
         def put(topic: str, message: Any, info: dict[str, Any]) -> None:
             self.put(topic, message, reception_time(info), info.get('source_timestamp', 0))
             on_message(types[topic][1])
@@ -102,10 +110,26 @@ class Observations:
         made = [*self._subscriptions.values()]
         if self._latched and 'image' in types:
             made.append(subscribe('image', CompressedImage, f'{types["image"][1]}/compressed'))
-        elif not self._latched:
+        elif not self._latched and not on_demand:
             node.create_subscription(Clock, 'clock', self.on_clock, qos_profile_sensor_data,
                                      callback_group=callback_group)
-        adapt_regularly(node, made, callback_group)
+        if not on_demand:
+            adapt_regularly(node, made, callback_group)
+        self._polled = made if on_demand else []
+
+    def poll(self) -> None:
+        """Take what has arrived, if that is done on demand alone."""
+        with self._changed:  # all topics together, in the order of reception
+            taken = sorted(((reception_time(info), one.subscription.callback, message, info)
+                            for one in self._polled
+                            for message, info in take_messages(one.subscription, POLL_LIMIT)),
+                           key=lambda found: found[0])
+            if time.monotonic() - self._adapted > ADAPT_PERIOD:
+                self._adapted = time.monotonic()
+                for one in self._polled:  # nothing waits in it now
+                    one.adapt()
+            for _, callback, message, info in taken:
+                callback(message, info)
 
     def names(self, topics: Iterable[str], explained: bool = False) -> str:
         """Return the full names of topics; explained: with why nothing arrives, where known."""
@@ -196,6 +220,7 @@ class Observations:
         :param after_ns: only what is stamped later than this.
         :param since: only what was received at or after this monotonic time.
         """
+        self.poll()
         with self._changed:
             found = [Moment(stamp, {topic: message for topic, (message, _) in parts.items()},
                             min(parts[topic][1] for topic in topics))
@@ -227,7 +252,7 @@ class Observations:
                 left = deadline - time.monotonic()
                 if found is not None or left <= 0:
                     return found
-                self._changed.wait(min(left, 0.1))
+                self._changed.wait(min(left, POLL_S if self._polled else 0.1))
         return None
 
     def wait_for_change(self, timeout_s: float, count: int) -> None:
@@ -243,6 +268,7 @@ class Observations:
 
     def missing(self, topics: Collection[str]) -> list[str]:
         """Return those of `topics` on which nothing has been received yet."""
+        self.poll()
         with self._changed:
             return [topic for topic in topics if self._topics[topic].received == -math.inf]
 

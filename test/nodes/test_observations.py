@@ -15,6 +15,7 @@ from sensor_msgs.msg import CompressedImage, Image, JointState
 from tap_msgs.msg import ObjectStates
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
+from tap_ros.ros.polling import PollOnlyGroup
 from tap_ros.ros.topics import encode_objects, LATCHED, STREAM, to_stamp
 
 
@@ -140,10 +141,12 @@ def test_time_in_a_queue_makes_a_message_older():
                for stamp in (0, time.time_ns() + 10**12)) >= now
 
 
-def test_topics_are_put_together_as_they_come(client):
+def test_topics_are_put_together_as_they_come_or_on_demand(client):
     types = {'image': (Image, 'eye/image'), 'joints': (JointState, 'arm/joints')}
     seen, told = Observations('image', 'joints'), []
     seen.subscribe(client, types, STREAM, on_message=told.append)
+    asked, taken = Observations('image', 'joints'), []
+    asked.subscribe(client, types, STREAM, PollOnlyGroup(), taken.append)
     publishers = [client.create_publisher(kind, name, STREAM) for kind, name in types.values()]
     begun = time.monotonic()
     for stamp in range(1, 600):
@@ -155,7 +158,8 @@ def test_topics_are_put_together_as_they_come(client):
     assert begun <= moment.received <= time.monotonic()
     assert {topic: type(message) for topic, message in moment.messages.items()} == {
         'image': Image, 'joints': JointState}
-    assert set(told) == {'eye/image', 'arm/joints'}
+    assert set(told) == {'eye/image', 'arm/joints'} and not taken
+    assert asked.wait(('image', 'joints'), 5) and set(taken) == set(told)
 
 
 def test_waiting_ends_with_the_message_with_giving_up_and_with_the_time():
@@ -179,14 +183,15 @@ def objects(stamp, u=3.0, v=8.0):
                           ObjectStates.SOURCE_TRACKED)
 
 
-def test_best_effort_and_volatile_publishers_are_heard(client):
+@pytest.mark.parametrize('group', [None, PollOnlyGroup()])
+def test_best_effort_and_volatile_publishers_are_heard(client, group):
     heard = []
     camera, goal = Observations('image'), Observations('image', 'objects', latched=True)
     for seen, types, qos in (
             (camera, {'image': (CompressedImage, 'camera/image_raw/compressed')}, STREAM),
             (goal, {'image': (CompressedImage, 'goal/image/compressed'),
                     'objects': (ObjectStates, 'goal/objects')}, LATCHED)):
-        seen.subscribe(client, types, qos, on_message=heard.append)
+        seen.subscribe(client, types, qos, group, heard.append)
     with Client('camera') as node:
         volatile = QoSProfile(depth=1)  # of a goal, as `ros2 topic pub` has it
         sends = [(node.create_publisher(type(message), topic, qos), message)
@@ -206,17 +211,19 @@ def test_what_was_latched_before_does_not_come_back(client):
     """A goal by hand, volatile, is not undone when its publisher has left."""
     kept = client.create_publisher(ObjectStates, 'goal/objects', LATCHED)
     kept.publish(objects(3 * 10**9, 3.0))
-    observed = Observations('objects', latched=True)
-    observed.subscribe(client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED)
+    asked, observed = (Observations('objects', latched=True) for _ in range(2))
+    for observations, group in ((asked, PollOnlyGroup()), (observed, None)):
+        observations.subscribe(
+            client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED, group)
 
     def newest():
-        found = observed.newest('objects')
-        return found and found.messages['objects'].objects[0].u
+        found = [each.newest('objects') for each in (asked, observed)]
+        return [one and one.messages['objects'].objects[0].u for one in found]
 
-    assert until(lambda: newest() == 3)
+    assert until(lambda: newest() == [3, 3])
     by_hand = client.create_publisher(ObjectStates, 'goal/objects', QoSProfile(depth=1))
-    assert until(lambda: by_hand.publish(objects(5 * 10**9, 5.0)) or newest() == 5,
+    assert until(lambda: by_hand.publish(objects(5 * 10**9, 5.0)) or newest() == [5, 5],
                  pause=0.2)
     client.destroy_publisher(by_hand)
     # Longer than it takes to look at what is offered.
-    assert not until(lambda: newest() != 5, 2, pause=0.1)
+    assert not until(lambda: newest() != [5, 5], 2, pause=0.1)

@@ -4,15 +4,12 @@
 
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 import time
 from typing import Any
 
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
@@ -23,15 +20,17 @@ from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.predictor import requests
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
-from tap_ros.ros.calls import drain, log_error, reason
+from tap_ros.ros.calls import log_error, reason
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.lifecycle import LifecycleBase
 from tap_ros.ros.parameters import check_device, Parameters
+from tap_ros.ros.polling import DeferredService
 from tap_ros.ros.robot_view import warn_if_unlike
 from tap_ros.ros.subscriptions import steady_timer
-from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, LATCHED, SERVICE_QOS
+from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, LATCHED
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
+Send = Callable[[PredictSubgoal.Response], object]
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
@@ -43,8 +42,8 @@ class PredictorNode(LifecycleBase):
     Offers the service only once the weights are loaded, checked and warmed up.
 
     Without autostart it offers the service at once, and refuses requests until it is active. One
-    thread checks and decodes the requests, another predicts what waits together; the executor
-    takes messages meanwhile, and sends the answers.
+    thread takes and checks the requests; another predicts what waits together, and sends the
+    answers.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -59,7 +58,6 @@ class PredictorNode(LifecycleBase):
             [name for _, name in goal.values()],
             queue=lambda: len(self._queue or ()), idle=self.why_not)
         self._reader = requests.RequestReader(self, self.params, self._diagnostics.received)
-        self._reading = ThreadPoolExecutor(1, 'reading')
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
@@ -67,16 +65,15 @@ class PredictorNode(LifecycleBase):
         self._unshown: deque[
             tuple[requests.PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
         steady_timer(self, SHOW_PERIOD, self._on_timer)
+        self._service = DeferredService(self, PredictSubgoal, 'predict_subgoal', self._on_request)
         self.autostart('activate')
-        self.create_service(PredictSubgoal, 'predict_subgoal', self._on_request,
-                            qos_profile=SERVICE_QOS, callback_group=ReentrantCallbackGroup())
+        self._service.start()
 
     def close(self) -> None:
         """Refuse all waiting requests, and let the running batch end."""
         if self._queue is not None:
             self._queue.close()
-        drain(self)  # what waits is refused: the node is ending
-        self._reading.shutdown()
+        self._service.close()  # what waits is refused: the node is ending
         self._show()
 
     # Lifecycle
@@ -111,17 +108,10 @@ class PredictorNode(LifecycleBase):
 
     # In the executor
 
-    async def _on_request(self, request: PredictSubgoal.Request,
-                          _: PredictSubgoal.Response) -> PredictSubgoal.Response:
-        """Answer a request once that is predicted; other callbacks run meanwhile."""
-        answer: Future = Future()
-        self._reading.submit(self._read, request, answer, time.perf_counter())
-        response: PredictSubgoal.Response = await answer
-        return response
-
     def _on_timer(self) -> None:
+        """Publish a new subgoal, and take messages so that diagnostics have their age and rate."""
         self._show()
-        self._reader.look()
+        self._reader.poll()
 
     def _show(self) -> None:
         """Publish the newest subgoal, for planners and people, if it is not published yet."""
@@ -139,24 +129,24 @@ class PredictorNode(LifecycleBase):
             self._diagnostics.error(error)
             log_error(self, 'subgoal', error)
 
-    # In the thread that reads
+    # In the thread of the service
 
-    def _read(self, request: PredictSubgoal.Request, answer: Future, begin: float) -> None:
-        """Check a request that came at time `begin` and put it into the queue, or refuse it."""
-        queue, predictor = self._queue, self._predictor
+    def _on_request(self, request: PredictSubgoal.Request, send: Send) -> None:
+        """Check a request and put it into the queue, or refuse it."""
+        begin, queue, predictor = time.perf_counter(), self._queue, self._predictor
         try:
             if not self.active or queue is None or predictor is None:
                 raise ConfigError(self.why_not())
             task = self._reader.read(request, predictor)
-            queue.put(task, lambda found: self._answer(task, found, answer, begin))
+            queue.put(task, lambda found: self._answer(task, found, send, begin))
         except Exception as error:
-            self._send(answer, self._refusal(error))
+            self._send(send, self._refusal(error))
 
     # In the thread of the queue
 
-    def _answer(self, task: requests.PendingRequest, found: Found | Exception, answer: Future,
+    def _answer(self, task: requests.PendingRequest, found: Found | Exception, send: Send,
                 begin: float) -> None:
-        """Encode the response to a task that came at time `begin`."""
+        """Send the response to a task that came at time `begin`."""
         try:
             if isinstance(found, Exception):
                 raise found
@@ -164,9 +154,9 @@ class PredictorNode(LifecycleBase):
             # Where to go first: the earliest subgoal of the first sample.
             shown = task, found[0][0], response.subgoals[0]
         except Exception as error:
-            self._send(answer, self._refusal(error))
+            self._send(send, self._refusal(error))
             return
-        self._send(answer, response)
+        self._send(send, response)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         self._unshown.append(shown)
 
@@ -183,11 +173,12 @@ class PredictorNode(LifecycleBase):
         return PredictSubgoal.Response(
             success=False, message=reason(self, 'predict_subgoal', error))
 
-    def _send(self, answer: Future, response: PredictSubgoal.Response) -> None:
-        """Have the executor send a response."""
-        answer.set_result(response)
-        if self.executor is not None:
-            self.executor.wake()
+    def _send(self, send: Send, response: PredictSubgoal.Response) -> None:
+        """Send a response; its client may have gone."""
+        try:
+            send(response)
+        except Exception as error:
+            log_error(self, 'predict_subgoal: a response cannot be sent', error)
 
 
 def predict(predictor: Predictor, tasks: list[requests.PendingRequest]) -> list[Found]:

@@ -27,6 +27,7 @@ from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.protocol import Predictor, Request
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.polling import PollOnlyGroup
 from tap_ros.ros.robot_view import RobotView
 from tap_ros.ros.subscriptions import publishers_of, rivals
 from tap_ros.ros.topics import camera_topics, encode_subgoal, goal_topics, LATCHED, STREAM
@@ -89,11 +90,13 @@ class RequestReader:
         for name, types, qos in (('start', camera_topics(params), STREAM),
                                  ('goal', goal_topics(params['robot_mask']), LATCHED)):
             self._newest[name] = Observations(*types, latched=name == 'goal')
-            self._newest[name].subscribe(node, types, qos, on_message=on_message)
+            self._newest[name].subscribe(node, types, qos, PollOnlyGroup(), on_message)
 
-    def look(self) -> None:
-        """Remember what the camera sees behind the robot."""
+    def poll(self) -> None:
+        """Take what has arrived, and remember what the camera sees behind the robot."""
         start = self._newest['start']
+        for observations in self._newest.values():
+            observations.poll()
         if self._robot.used and (found := start.newest('image', 'mask')) is not None:
             with suppress(TapError):  # a request for this picture is refused with it
                 self._robot.see(found.messages['image'], found.messages['mask'], start.jumps)
