@@ -15,7 +15,7 @@ from sim_bridge.simulator import Simulator
 from tap_msgs.msg import CommandRefused, ObjectStates
 from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.ros.calls import CallError
-from tap_ros.ros.client import request_fields
+from tap_ros.ros.requests import request_fields
 from tap_ros.ros.topics import encode_image, encode_joints, encode_objects, STREAM, to_stamp
 
 STOP_S = 0.5  # within which a stop has to come

@@ -32,7 +32,8 @@ from tap_ros.nodes.predictor.requests import MAX_TOGETHER as TOGETHER
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.protocol import Request
 from tap_ros.ros.calls import call, CallError
-from tap_ros.ros.client import Client, request_fields
+from tap_ros.ros.client import Client
+from tap_ros.ros.requests import request_fields
 from tap_ros.ros.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights import DEFAULT_PREDICTOR
 

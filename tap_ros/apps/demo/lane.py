@@ -28,7 +28,8 @@ from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.robots.arm import get_arm
-from tap_ros.ros.client import Client, positions_of
+from tap_ros.ros.client import Client
+from tap_ros.ros.views import positions_of
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 if TYPE_CHECKING:
