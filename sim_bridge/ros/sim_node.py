@@ -3,6 +3,7 @@
 """The simulator as a ROS node: camera, objects and clock out, twist commands in."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 import math
 import time
 from typing import Any
@@ -21,14 +22,13 @@ from tap_msgs.msg import CommandRefused, Episode
 from tap_msgs.srv import ResetScene, SetGoal, StepScene
 from tap_ros.base.contract import ACTION_LIMIT, CONTROL_PERIOD, WORLD_FRAME
 from tap_ros.base.errors import TapError
-from tap_ros.base.plugins import names
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.robots.arm import DEFAULT_ARM
 from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
-from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.parameters import Parameters, setting
 from tap_ros.ros.subscriptions import steady_timer
 from tap_ros.ros.topics import LATCHED, LOCK_STEP, SERVICE_QOS, STREAM, to_stamp
 
@@ -36,7 +36,6 @@ PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 COMMAND_TIMEOUT, MAX_TIMEOUT = 1.0, 60.0  # s that a command is valid, unless its sender says so
 MAX_PERIODS = 100  # of a call that is answered when they have passed: about a second
-OPTIONS = {'look': DEFAULT_LOOK, 'appearance': 'usual', 'arm': DEFAULT_ARM}  # if taken
 LAST_MARK_S = 1.0  # s that the end mark of the last episode may take to arrive
 
 
@@ -248,8 +247,8 @@ class SimNode(Node):
     # Simulation
 
     def _make_world(self, task: str) -> World:
-        options = {name: self.params[name] for name in OPTIONS
-                   if self.params[name] != OPTIONS[name]}
+        options = {name: self.params[name] for name in ('look', 'appearance', 'arm')
+                   if self.params[name] != getattr(SimParameters, name)}
         return make_world(self.params['world'], task, self.params['image_size'], **options)
 
     def _reset(self, task: str, seed: int, hide_arm: bool) -> None:
@@ -312,37 +311,45 @@ class SimNode(Node):
         self._episode.publish(message)
 
 
+@dataclass(frozen=True)
+class SimParameters:
+    """
+    Parameters of the node.
+
+    :param world: The simulated world; other packages may add some.
+    :param task: Task of the first scene, one that the world has.
+    :param seed: Seed of the first scene.
+    :param image_size: Width and height of the pictures in pixels.
+    :param look: What the camera's pictures show: the whole arm at a wooden table, or its hand
+        alone.
+    :param arm: The arm at the table.
+    :param appearance: Table, light and camera; random: drawn from the seed of each scene.
+    :param observer: Publish observer/image_raw, the camera's view with the whole arm.
+    :param objects: Where the objects of all nodes come from: objects and goal/objects are the
+        ground truth, or tracker_node's, and the truth is on truth/objects and truth/goal/objects
+        (tracked).
+    :param lock_step: True: each twist command lets one control period pass, so that runs repeat
+        exactly. False: time passes by itself.
+    :param resend_period: Seconds after which, in lock-step, the newest picture is sent again.
+    :param real_time_factor: Simulated seconds per second when not in lock-step.
+    """
+
+    world: str = setting('mujoco_table', plugins='tap_ros.worlds')
+    task: str = 'push2'
+    seed: int = setting(0, between=(0, 2**62))
+    image_size: int = setting(64, between=(16, 1024))
+    look: str = setting(DEFAULT_LOOK, choices=tuple(LOOKS))
+    arm: str = setting(DEFAULT_ARM, plugins='tap_ros.arms')
+    appearance: str = setting('usual', choices=tuple(CHOICES))
+    observer: bool = False
+    objects: str = setting('truth', choices=('truth', 'tracked'))
+    lock_step: bool = False
+    resend_period: float = setting(0.2, between=(0.02, 10.0))
+    real_time_factor: float = setting(1.0, between=(0.05, 20.0))
+
+
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('world', 'mujoco_table', 'The simulated world; other packages may add '
-                       'some.', choices=names('tap_ros.worlds'))
-    parameters.declare('task', 'push2', 'Task of the first scene, one that the world has.')
-    parameters.declare('seed', 0, 'Seed of the first scene.', between=(0, 2**62))
-    parameters.declare('image_size', 64, 'Width and height of the pictures in pixels.',
-                       between=(16, 1024))
-    parameters.declare(
-        'look', OPTIONS['look'],
-        "What the camera's pictures show: the whole arm at a wooden table, or its hand alone.",
-        choices=list(LOOKS))
-    parameters.declare('arm', DEFAULT_ARM, 'The arm at the table.', choices=names('tap_ros.arms'))
-    parameters.declare(
-        'appearance', OPTIONS['appearance'], 'Table, light and camera; random: drawn from '
-        'the seed of each scene.', choices=list(CHOICES))
-    parameters.declare(
-        'observer', False, "Publish observer/image_raw, the camera's view with the whole arm.")
-    parameters.declare(
-        'objects', 'truth', 'Where the objects of all nodes come from: objects and goal/objects '
-        "are the ground truth, or tracker_node's, and the truth is on truth/objects and "
-        'truth/goal/objects (tracked).', choices=('truth', 'tracked'))
-    parameters.declare(
-        'lock_step', False,
-        'True: each twist command lets one control period pass, so that runs repeat exactly. '
-        'False: time passes by itself.')
-    parameters.declare(
-        'resend_period', 0.2,
-        'Seconds after which, in lock-step, the newest picture is sent again.',
-        between=(0.02, 10.0))
-    parameters.declare('real_time_factor', 1.0,
-                       'Simulated seconds per second when not in lock-step.', between=(0.05, 20.0))
+    parameters.declare_fields(SimParameters)
     return parameters

@@ -3,8 +3,9 @@
 """Parameters with a description and a range, and those that several nodes have."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -17,33 +18,49 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from tap_ros.base import plugins
 from tap_ros.base.contract import ROBOT_MASKS
 from tap_ros.base.errors import ConfigError
-from tap_ros.base.plugins import names
 from tap_ros.base.text import listing
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
 
 FARTHEST = 100.0  # m; no camera is there
 OF_RCLPY = {'use_sim_time', 'start_type_description_service'}  # parameters of any node
-# Of several nodes: default, description, and what else Parameters.declare takes.
-SHARED: dict[str, tuple[Any, str, dict[str, Any]]] = {
-    'autostart': (
-        True, 'Load the weights and be active at once; false: wait for the transitions configure '
-        'and activate.', {}),
-    'device': (
-        'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
-        {'choices': ('cpu', 'cuda')}),
-    'image_transport': (
-        'raw', 'How the camera sends pictures: sensor_msgs/Image on camera/image_raw (raw), or '
-        'CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).',
-        {'choices': ('raw', 'compressed')}),
-    'robot_mask': (
-        'none', 'What camera/robot_mask takes out of the pictures: nothing (none), the arm with '
-        'its shadow (arm), or the whole robot (all). What was seen there free last takes its '
-        'place.', {'choices': ROBOT_MASKS}),
-    'joint_prefix': (
-        '', "What the names of the robot's joints begin with in joint_states, before "
-        'shoulder_pan_joint and so on.', {})}
+def setting(default: Any, **limits: Any) -> Any:
+    """
+    Return a field of a dataclass of parameters, whose `:param` lines describe them.
+
+    :param limits: what else Parameters.declare takes; plugins: the choices are the names of this
+        group of entry points.
+    """
+    return field(default=default, metadata=limits)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """
+    Parameters that several nodes have.
+
+    :param autostart: Load the weights and be active at once; false: wait for the transitions
+        configure and activate.
+    :param device: Where the network runs, as torch names it: cpu, cuda.
+    :param image_transport: How the camera sends pictures: sensor_msgs/Image on camera/image_raw
+        (raw), or CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).
+    :param robot_mask: What camera/robot_mask takes out of the pictures: nothing (none), the arm
+        with its shadow (arm), or the whole robot (all). What was seen there free last takes its
+        place.
+    :param joint_prefix: What the names of the robot's joints begin with in joint_states, before
+        shoulder_pan_joint and so on.
+    :param fixed_opening: Opening of the gripper, 0 to 1, where no joint_states has
+        gripper_opening; 0 is closed, as for pushing.
+    """
+
+    autostart: bool = True
+    device: str = setting('cpu', choices=('cpu', 'cuda'))
+    image_transport: str = setting('raw', choices=('raw', 'compressed'))
+    robot_mask: str = setting('none', choices=ROBOT_MASKS)
+    joint_prefix: str = ''
+    fixed_opening: float = setting(0.0, between=(0.0, 1.0))
 
 
 class Parameters:
@@ -99,21 +116,33 @@ class Parameters:
             raise ConfigError(
                 f'parameter {name}: {reason}. {description} Default: {default!r}') from error
 
+    def declare_fields(self, kind: type, *names: str, **defaults: Any) -> None:
+        """
+        Declare the fields of a dataclass.
+
+        :param names: of those to declare; by default all. defaults: other ones than the usual.
+        """
+        about = dict(re.findall(
+            r':param (\w+): (.*?)\s*(?=:param|\Z)', kind.__doc__ or '', re.DOTALL))
+        for one in fields(kind):
+            if not names or one.name in names:
+                limits = dict(one.metadata)
+                if 'plugins' in limits:
+                    limits['choices'] = plugins.names(limits.pop('plugins'))
+                self.declare(one.name, defaults.get(one.name, one.default),
+                             ' '.join(about[one.name].split()), **limits)
+
     def declare_shared(self, *names: str, **defaults: Any) -> None:
-        """Declare some of SHARED, with their usual or with other defaults."""
-        for name in (*names, *defaults):
-            default, description, limits = SHARED[name]
-            self.declare(name, defaults.get(name, default), description, **limits)
+        """Declare some of Shared, with their usual or with other defaults."""
+        self.declare_fields(Shared, *names, *defaults, **defaults)
 
     def declare_arm(self) -> None:
         """Declare arm, mount and opening: used for joint states that lack the gripper's."""
         arm = self.declare(
             'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
-            'joints and not gripper_x.', choices=names('tap_ros.arms'))
+            'joints and not gripper_x.', choices=plugins.names('tap_ros.arms'))
         self.declare_mount(arm)
-        self.declare('fixed_opening', 0.0,
-                     'Opening of the gripper, 0 to 1, where no joint_states has '
-                     'gripper_opening; 0 is closed, as for pushing.', between=(0.0, 1.0))
+        self.declare_shared('fixed_opening')
 
     def declare_mount(self, arm: str) -> None:
         """Declare the place of an arm; by default at the simulated table."""

@@ -28,6 +28,7 @@ from tap_ros.nodes.planner.arm import ArmCommander
 from tap_ros.nodes.planner.goals import GoalSource
 from tap_ros.nodes.planner.plan_view import draw_plan
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
+from tap_ros.nodes.planner.settings import declare_parameters
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.reach import Command, End, Reach, SelectTargets
 from tap_ros.planning.visual_mpc import VisualMPC
@@ -67,7 +68,7 @@ class VisualMpcNode(LifecycleBase):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('visual_mpc_node', **options)
-        self.params = settings.declare_parameters(self)
+        self.params = declare_parameters(self)
         self._halt = ''  # why no goal may go on
         self._ended: tuple[ServerGoalHandle | None, str] = None, ''  # that has to end, and why
         self._sender_gone: tuple[ServerGoalHandle, Callable[[], bool]] | None = None

@@ -3,6 +3,7 @@
 """Records topics into MCAP bags, as serialized messages; what happens when the disk fails."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 import time
@@ -21,7 +22,7 @@ from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.recording.writer import BagWriter
 from tap_ros.ros.calls import answering, drain, DRAIN_S
 from tap_ros.ros.diagnostics import Diagnostics
-from tap_ros.ros.parameters import declared_mount, Parameters
+from tap_ros.ros.parameters import declared_mount, Parameters, setting
 from tap_ros.ros.subscriptions import AdaptiveSubscription, steady_timer
 from tap_ros.ros.topics import camera_image, message_class, SERVICE_QOS
 
@@ -272,16 +273,26 @@ def _known(name: str) -> Topic | None:
     return BY_NAME.get(name.lstrip('/').removesuffix('/compressed'))
 
 
+@dataclass(frozen=True)
+class RecorderParameters:
+    """
+    Parameters that this node alone has.
+
+    :param folder: Folder of the bag; if it exists, a number is added to the name.
+    :param compression: Compression of chunks.
+    :param record_on_start: Record from the start; else from the call of recorder/record on.
+    """
+
+    folder: str = 'bags/recording'
+    compression: str = setting('zstd', choices=('zstd', 'lz4', 'none'))
+    record_on_start: bool = True
+
+
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('folder', 'bags/recording',
-                       'Folder of the bag; if it exists, a number is added to the name.')
+    parameters.declare_fields(RecorderParameters)
     parameters.declare('topics', list(BY_NAME), 'Topics to record.')
-    parameters.declare('compression', 'zstd', 'Compression of chunks.',
-                       choices=['zstd', 'lz4', 'none'])
     parameters.declare_shared('image_transport')
     parameters.declare_arm()
-    parameters.declare('record_on_start', True,
-                       'Record from the start; else from the call of recorder/record on.')
     return parameters

@@ -16,7 +16,7 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import SelectObjects
 from tap_ros.base.contract import WORLD_FRAME
 from tap_ros.base.errors import TapError, TrackingError
-from tap_ros.base.plugins import load_plugin, names
+from tap_ros.base.plugins import load_plugin
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.images import is_empty
 from tap_ros.messages.objects import decode_objects, MAX_OBJECTS
@@ -26,7 +26,7 @@ from tap_ros.nodes.tracker.inputs import TrackerInputs
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.ros.calls import answering, log_error
 from tap_ros.ros.observations import Moment
-from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.parameters import Parameters, setting
 from tap_ros.ros.subscriptions import Publishers, rivals
 from tap_ros.ros.topics import encode_objects, LATCHED, SERVICE_QOS, STREAM
 from tap_ros.tracking.plane import MIDDLE, Plane
@@ -326,18 +326,29 @@ class TrackerNode(Node):
             tracked.states, tracked.confidence)
 
 
+@dataclass(frozen=True)
+class TrackerParameters:
+    """
+    Parameters that this node alone has.
+
+    :param tracker: What follows the objects: their shapes on the table (rigid), or a tracker of
+        another package.
+    :param max_silence: Seconds; of a picture without joint states nearer to it than this the
+        gripper is not known.
+    :param patience: Seconds that the joints of a picture, or the robot mask of a goal, are waited
+        for.
+    """
+
+    tracker: str = setting('rigid', plugins='tap_ros.trackers')
+    max_silence: float = setting(0.35, between=(0.05, 60.0), read_only=False)
+    patience: float = setting(0.1, between=(0.0, 60.0))
+
+
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('tracker', 'rigid', 'What follows the objects: their shapes on the table '
-                       '(rigid), or a tracker of another package.',
-                       choices=names('tap_ros.trackers'))
+    parameters.declare_fields(TrackerParameters)
     parameters.declare_shared('image_transport', 'joint_prefix', robot_mask='all')
     parameters.declare_camera(f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
     parameters.declare_arm()
-    parameters.declare('max_silence', 0.35,
-                       'Seconds; of a picture without joint states nearer to it than this the '
-                       'gripper is not known.', between=(0.05, 60.0), read_only=False)
-    parameters.declare('patience', 0.1, 'Seconds that the joints of a picture, or the robot mask '
-                       'of a goal, are waited for.', between=(0.0, 60.0))
     return parameters
