@@ -81,12 +81,10 @@ class SimNode(Node):
         self._lock_step = self.create_publisher(Bool, LOCK_STEP, LATCHED)
         self._lock_step.publish(Bool(data=self.params['lock_step']))
         # Subscribed before the twist, so that of two commands sent together it is taken first.
-        subscriptions: list[tuple[Any, str, Callable[..., None], Any]] = [
-            (Float64, 'gripper/command', self._on_gripper, STREAM),
-            (TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM),
-            (Float64, 'arm/command_timeout', self._on_timeout, LATCHED)]
-        for subscription in subscriptions:
-            self.create_subscription(*subscription)
+        subscribe: Callable[..., Any] = self.create_subscription  # rclpy does not type the info
+        subscribe(Float64, 'gripper/command', self._on_gripper, STREAM)
+        subscribe(TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM)
+        subscribe(Float64, 'arm/command_timeout', self._on_timeout, LATCHED)
         self._resend: Timer | None = None
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
@@ -94,16 +92,14 @@ class SimNode(Node):
                                    (StepScene, 'sim/step', self._on_step),
                                    (SetBool, 'sim/pause', self._on_pause)):
             self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
+        factor, mode = self.params['real_time_factor'], 'lock-step'
         if self.params['lock_step']:
-            mode = 'lock-step'
             self._resend = steady_timer(
                 self, self.params['resend_period'], self._topics.send_newest)
         else:
-            factor = self.params['real_time_factor']
             steady_timer(self, CONTROL_PERIOD / factor, self._on_timer)
             mode = f'{factor:g} x real time'
-        self.get_logger().info(
-            f'ready: task {task}, seed {self.params["seed"]}, {mode}')
+        self.get_logger().info(f'ready: task {task}, seed {self.params["seed"]}, {mode}')
 
     def close(self) -> None:
         """End the episode, and wait until its mark has been delivered."""
@@ -115,17 +111,13 @@ class SimNode(Node):
 
     def _on_gripper(self, message: Float64, info: dict[str, Any]) -> None:
         self._diagnostics.received('gripper/command')
-        reason = self._refuse_paused(info)
+        reason = self._refuse_paused(info) or ('' if math.isfinite(message.data) else (
+            f'data is {message.data}; expected a number from 0 (closed) to 1 (open)'))
         if reason:
             self.get_logger().warning(
                 f'gripper/command ignored: {reason}', throttle_duration_sec=5.0)
-            return
-        if not math.isfinite(message.data):
-            self.get_logger().warning(
-                f'gripper/command ignored: data is {message.data}; expected a number from '
-                '0 (closed) to 1 (open)')
-            return
-        self._opening = min(max(message.data, 0.0), 1.0)
+        else:
+            self._opening = min(max(message.data, 0.0), 1.0)
 
     def _on_twist(self, message: TwistStamped, info: dict[str, Any]) -> None:
         self._diagnostics.received('arm/delta_twist_cmds')
@@ -134,9 +126,8 @@ class SimNode(Node):
         if stamp_ns == 0 and not move.any():
             self._twist = None
             return
-        reason = (self._refuse_paused(info)
-                  or self._refuse_twist(message.twist, move, stamp_ns))
-        if reason:
+        if reason := self._refuse_paused(info) or self._refuse_twist(
+                message.twist, move, stamp_ns):
             self.get_logger().warning(f'arm/delta_twist_cmds ignored: {reason}')
             self._diagnostics.error(f'arm/delta_twist_cmds ignored: {reason}')
             self._refused.publish(CommandRefused(header=message.header, message=reason))
@@ -195,28 +186,23 @@ class SimNode(Node):
     def _on_timer(self) -> None:
         if not self._paused:
             move, self._twist = self._twist, None
-            if move is None or time.monotonic() > self._valid_until:
-                move = np.zeros(3)
-            self._step(move)
+            late = time.monotonic() > self._valid_until
+            self._step(np.zeros(3) if move is None or late else move)
 
     # Services
 
     def _on_reset(self, request: ResetScene.Request,
-                  response: ResetScene.Response) -> ResetScene.Response:
+                  _: ResetScene.Response) -> ResetScene.Response:
         self._reset(request.task or 'push2', request.seed, request.hide_arm)
-        response.success = True
-        response.message = f'{self._sim.task_name}, seed {request.seed}'
-        return response
+        return ResetScene.Response(
+            success=True, message=f'{self._sim.task_name}, seed {request.seed}')
 
-    def _on_set_goal(self, request: SetGoal.Request,
-                     response: SetGoal.Response) -> SetGoal.Response:
+    def _on_set_goal(self, request: SetGoal.Request, _: SetGoal.Response) -> SetGoal.Response:
         names, pixels = decode_objects(
             request.objects, 'objects', self._sim.goal().image.shape[:2])
         ability(self._sim, 'move_goal')(names, pixels)
         self._publish_goal()
-        response.success = True
-        response.message = f'moved {", ".join(names)}'
-        return response
+        return SetGoal.Response(success=True, message=f'moved {", ".join(names)}')
 
     def _on_step(self, request: StepScene.Request,
                  response: StepScene.Response) -> StepScene.Response:
@@ -235,14 +221,12 @@ class SimNode(Node):
         response.stamp = to_stamp(self._stamp_ns)
         return response
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def _on_pause(self, request: SetBool.Request, _: SetBool.Response) -> SetBool.Response:
         if request.data != self._paused:  # what was commanded and is not done yet is forgotten
             self._twist, self._opening = None, self._done_opening
             self._paused = request.data
             self._played_at = math.inf if self._paused else time.monotonic()
-        response.success = True
-        response.message = 'paused' if request.data else 'running'
-        return response
+        return SetBool.Response(success=True, message='paused' if request.data else 'running')
 
     # Simulation
 
@@ -253,10 +237,7 @@ class SimNode(Node):
 
     def _reset(self, task: str, seed: int, hide_arm: bool) -> None:
         """Start a scene; if it cannot be, the present one stays as it is."""
-        if task == self._sim.task_name:
-            sim = self._sim
-        else:
-            sim = self._make_world(task)
+        sim = self._sim if task == self._sim.task_name else self._make_world(task)
         self._end_episode()
         observation = sim.reset(seed)
         if sim is not self._sim:

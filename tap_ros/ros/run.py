@@ -91,7 +91,11 @@ def main(name: str = '', args: list[str] | None = None) -> int:
     finally:
         _handle_signals(lambda *_: None)  # it is ending already
         if node is not None:
-            code = _close(node) or code  # first of all: it stops the arm
+            try:
+                code = node.close() or code  # first of all: it stops the arm
+            except Exception as error:
+                log_error(node, 'the node did not end cleanly', error)
+                code = 1
         if heartbeat is not None:
             heartbeat.end()
         if executor is not None:
@@ -149,12 +153,3 @@ def _handle_signals(handler: Callable[[int, Any], Any]) -> None:
         signal.signal(number, handler)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
         signal.signal(signal.SIGHUP, handler)
-
-
-def _close(node: Any) -> int:
-    """Let the node end what it does; return its exit code."""
-    try:
-        return node.close() or 0
-    except Exception as error:
-        log_error(node, 'the node did not end cleanly', error)
-        return 1

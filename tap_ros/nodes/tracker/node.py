@@ -125,9 +125,14 @@ class TrackerNode(Node):
 
         :raises TapError: for names or clicks that cannot be used; then nothing changes.
         """
-        found, clicks = self._asked(request, view.image.shape[:2])
-        cameras = rivals(self._inputs.publishers())
-        if cameras:
+        if not 1 <= len(request.names) == len(request.u) == len(request.v) <= MAX_OBJECTS:
+            raise TrackingError(
+                f'names, u and v have {len(request.names)}, {len(request.u)} and '
+                f'{len(request.v)} entries; expected as many of each, 1 to {MAX_OBJECTS}')
+        found, clicks = decode_objects(encode_objects(
+            request.names, np.column_stack([request.u, request.v]), None, 0, '',
+            ObjectStates.SOURCE_TRACKED), 'select_objects', view.image.shape[:2])
+        if cameras := rivals(self._inputs.publishers()):
             raise TrackingError(f'{cameras}; leave one of them')
         others = self.count_publishers('objects') - 1
         if others > 0:
@@ -167,17 +172,6 @@ class TrackerNode(Node):
             raise TrackingError('the goal picture shows nothing elsewhere; click on each object')
         return tracker.select(view, found)  # for the outlines
 
-    def _asked(self, request: SelectObjects.Request,
-               size: tuple[int, int]) -> tuple[tuple[str, ...], np.ndarray]:
-        """Return names and clicks (K, 2) of a request; TapError for those that are of no use."""
-        if not 1 <= len(request.names) == len(request.u) == len(request.v) <= MAX_OBJECTS:
-            raise TrackingError(
-                f'names, u and v have {len(request.names)}, {len(request.u)} and '
-                f'{len(request.v)} entries; expected as many of each, 1 to {MAX_OBJECTS}')
-        clicks = np.column_stack([request.u, request.v])
-        asked = encode_objects(request.names, clicks, None, 0, '', ObjectStates.SOURCE_TRACKED)
-        return decode_objects(asked, 'select_objects', size)
-
     # Following
 
     def _follow(self) -> None:
@@ -199,8 +193,9 @@ class TrackerNode(Node):
 
     def _look_at_camera(self, selection: Selection) -> None:
         """Follow the objects in the newest picture."""
-        changed = self._other_scene(selection)
-        if changed:
+        if changed := rivals(self._inputs.publishers(), selection.publishers) or (
+                '' if self._sensors.jumps == selection.jumps else 'the clock of its pictures has '
+                'jumped: another camera, simulator or recording'):
             self._forget(changed)
             return
         moment = self._inputs.newest()
@@ -217,8 +212,7 @@ class TrackerNode(Node):
         self._selection = replace(
             selection, stamp_ns=moment.stamp_ns, received=moment.received, message=None)
         view = self._inputs.view(moment)
-        changed = self._other_camera(selection, view.image.shape[:2])
-        if changed:
+        if changed := self._other_camera(selection, view.image.shape[:2]):
             self._forget(changed)
             return
         begin = time.perf_counter()
@@ -268,12 +262,6 @@ class TrackerNode(Node):
         """Return whether another episode has begun since a selection."""
         return (self._inputs.scene_ns() > selection.selected_ns
                 and self._sensors.jumps == selection.jumps)
-
-    def _other_scene(self, selection: Selection) -> str:
-        """Say in what way the camera shows another scene than that of a selection, '' if not."""
-        if self._sensors.jumps != selection.jumps:
-            return 'the clock of its pictures has jumped: another camera, simulator or recording'
-        return rivals(self._inputs.publishers(), selection.publishers)
 
     def _other_camera(self, selection: Selection, size: tuple[int, int]) -> str:
         """Say how pictures of a size differ from those of a selection, '' if they do not."""
