@@ -63,7 +63,7 @@ class ScenePublishers:
             self._fixed = node.create_publisher(TFMessage, 'tf_static', LATCHED)
 
     def moment(self, world: World, seen: Observation, stamp: Time) -> None:
-        """Publish a moment; its transforms once: of a second time listeners would complain."""
+        """Publish a moment; its transforms once: listeners warn of a second time."""
         arm = world.arm
         self._newest = {
             'clock': Clock(clock=stamp),

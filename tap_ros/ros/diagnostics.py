@@ -118,9 +118,9 @@ class Diagnostics:
             for topic, source in self._inputs.items():
                 message.status.append(self._describe_input(topic, source, now))
         self._publisher.publish(message)
-        self._tell_silence(now)
+        self._log_silence(now)
 
-    def _tell_silence(self, now: float) -> None:
+    def _log_silence(self, now: float) -> None:
         """Warn, once each time, of inputs that are silent, and of cameras that share a topic."""
         silent = {topic for topic, source in self._inputs.items()
                   if now - max(source.newest, self._begun) > SILENT_SECONDS and (

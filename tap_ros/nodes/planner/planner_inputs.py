@@ -55,7 +55,8 @@ class PlannerInputs:
         self.robot = RobotView(params['robot_mask'])
         types = {**camera_topics(params), 'joints': of_topic(JOINT_STATES)}
         self.topics = tuple(types)
-        self._names = {key: node.resolve_topic_name(name) for key, (_, name) in types.items()}
+        self._names = {key: name for key, (_, name) in types.items()}
+        self._full = {key: node.resolve_topic_name(name) for key, name in self._names.items()}
         self.sensors = Observations(*types)
         self._gripper = GripperHistory(
             declared_arm(params), params['joint_prefix'], params['fixed_opening'])
@@ -87,10 +88,10 @@ class PlannerInputs:
         if rival := rivals(publishers, self._publishers):
             raise PlanningError(
                 f'the scene has changed: {rival}; leave one, and send the goal again')
-        if cameras := rivals({name: publishers[name] for key, name in self._names.items()
+        if cameras := rivals({name: publishers[name] for key, name in self._full.items()
                               if key in ('image', 'mask')}):
             return None, f'{cameras}; leave one of them'  # one may have ended just now
-        missing, found = self._missing(), self._newest(*self.topics[:-1], since=self._since)
+        found, missing = self._newest(*self.topics[:-1], since=self._since), self._missing()
         if found is None:
             return None, missing or self._unmatched_joints() or (
                 f'no messages of the same stamp on {self.sensors.names(self.topics)} since the '
@@ -102,7 +103,7 @@ class PlannerInputs:
             self._seen = self._decode(moment, gripper)
             self.frame_id = moment.messages['image'].header.frame_id
         # Nothing ages where what moves the arm waits for commands, and says so itself.
-        if self._lock_step and pacers and pacers <= publishers[self._names['joints']].keys():
+        if self._lock_step and pacers and pacers <= publishers[self._full['joints']].keys():
             received = math.inf
         known = begun_jumps == jumps and begun_ns <= moment.stamp_ns + JUMP_NS
         self._seen = replace(
@@ -201,13 +202,14 @@ class PlannerInputs:
     def _on_camera(self, name: str) -> None:
         """Remember what the camera sees behind the robot, between goals too."""
         self._on_message(name)
-        if self.robot.used and (moment := self.sensors.newest('image', 'mask')) is not None:
+        if self.robot.used and name != self._names['objects'] and (
+                moment := self.sensors.newest('image', 'mask')) is not None:
             with suppress(TapError):  # look() reports it
                 self._picture(moment.messages)
 
     def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
         """Take joint states of the gripper, of the arm, or of another driver."""
-        self._on_message(JOINT_STATES.name)
+        self._on_message(self._names['joints'])
         try:
             if self._gripper.take(message, reception_time(info), self.sensors.time_stands):
                 self._joints_error = ''
