@@ -51,6 +51,8 @@ class Shared:
         place.
     :param joint_prefix: What the names of the robot's joints begin with in joint_states, before
         shoulder_pan_joint and so on.
+    :param arm: The arm. Heeded, as where it stands, where joint_states has its joints and not
+        gripper_x.
     :param fixed_opening: Opening of the gripper, 0 to 1, where no joint_states has
         gripper_opening; 0 is closed, as for pushing.
     """
@@ -60,7 +62,53 @@ class Shared:
     image_transport: str = setting('raw', choices=('raw', 'compressed'))
     robot_mask: str = setting('none', choices=ROBOT_MASKS)
     joint_prefix: str = ''
+    arm: str = setting(DEFAULT_ARM, plugins='tap_ros.arms')
     fixed_opening: float = setting(0.0, between=(0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class MountParameters:
+    """
+    Where an arm stands.
+
+    :param mount_x: x of the base of the arm in the world, m; of its controller's frame "base".
+    :param mount_y: y of the base of the arm in the world, m; of its controller's frame "base".
+    :param mount_z: z of the base of the arm in the world, m; of its controller's frame "base".
+    :param mount_turn: Turn of that frame about the vertical, rad; the base stands upright.
+    :param tool_length: From the flange to the fingertips along its z, m.
+    """
+
+    mount_x: float = setting(0.0, between=(-10.0, 10.0))
+    mount_y: float = setting(0.0, between=(-10.0, 10.0))
+    mount_z: float = setting(0.0, between=(-10.0, 10.0))
+    mount_turn: float = setting(0.0, between=(-2 * math.pi, 2 * math.pi))
+    tool_length: float = setting(0.0, between=(0.0, 2.0))
+
+
+@dataclass(frozen=True)
+class CameraParameters:
+    """
+    Where the camera is, and what counts of its camera_info.
+
+    :param camera_x: x of the camera in the world, for robot_mask_node in base_frame, m.
+    :param camera_y: y of the camera, m; likewise.
+    :param camera_z: z of the camera, m; likewise. With 0 tracker_node takes camera/pose.
+    :param camera_qx: x of the quaternion that turns the camera's optical frame (z forward, x
+        right, y down in the picture) into that frame.
+    :param camera_qy: y of that quaternion.
+    :param camera_qz: z of that quaternion.
+    :param camera_qw: w of that quaternion.
+    :param rectified: The pictures are rectified: P of camera_info counts, else K.
+    """
+
+    camera_x: float = setting(0.0, between=(-FARTHEST, FARTHEST))
+    camera_y: float = setting(0.0, between=(-FARTHEST, FARTHEST))
+    camera_z: float = setting(0.0, between=(-FARTHEST, FARTHEST))
+    camera_qx: float = setting(1.0, between=(-1.0, 1.0))
+    camera_qy: float = setting(0.0, between=(-1.0, 1.0))
+    camera_qz: float = setting(0.0, between=(-1.0, 1.0))
+    camera_qw: float = setting(0.0, between=(-1.0, 1.0))
+    rectified: bool = False
 
 
 class Parameters:
@@ -138,41 +186,19 @@ class Parameters:
 
     def declare_arm(self) -> None:
         """Declare arm, mount and opening: used for joint states that lack the gripper's."""
-        arm = self.declare(
-            'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
-            'joints and not gripper_x.', choices=plugins.names('tap_ros.arms'))
-        self.declare_mount(arm)
-        self.declare_shared('fixed_opening')
+        self.declare_shared('arm', 'fixed_opening')
+        self.declare_mount(self['arm'])
 
     def declare_mount(self, arm: str) -> None:
         """Declare the place of an arm; by default at the simulated table."""
-        default = get_arm(arm).mount
-        for axis, value in zip('xyz', default.position):
-            self.declare(
-                f'mount_{axis}', value, f'{axis} of the base of the arm in the world, m; of its '
-                'controller\'s frame "base".', between=(-10.0, 10.0))
-        self.declare('mount_turn', default.yaw,
-                     'Turn of that frame about the vertical, rad; the base stands upright.',
-                     between=(-2 * math.pi, 2 * math.pi))
-        self.declare('tool_length', default.tool,
-                     'From the flange to the fingertips along its z, m.', between=(0.0, 2.0))
-
-    def declare_camera(self, frame: str) -> None:
-        """Declare the pose of the camera in a frame, and what counts of its camera_info."""
-        for axis in 'xyz':
-            self.declare(f'camera_{axis}', 0.0, f'{axis} of the camera in {frame}, m.',
-                         between=(-FARTHEST, FARTHEST))
-        for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
-            self.declare(
-                f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
-                f'optical frame (z forward, x right, y down in the picture) into {frame}.',
-                between=(-1.0, 1.0))
-        self.declare('rectified', False,
-                     'The pictures are rectified: P of camera_info counts, else K.')
+        mount = get_arm(arm).mount
+        x, y, z = mount.position
+        self.declare_fields(MountParameters, mount_x=x, mount_y=y, mount_z=z,
+                            mount_turn=mount.yaw, tool_length=mount.tool)
 
     def camera_pose(self) -> np.ndarray:
         """
-        Return the pose (4, 4) of the camera, by the parameters of declare_camera.
+        Return the pose (4, 4) of the camera, by CameraParameters.
 
         :raises ConfigError: for a quaternion of length 0, and for numbers of no pose.
         """

@@ -78,6 +78,16 @@ class DeferredService:
         while self._take_one():
             pass
 
+    def _send(self, response: Any, header: Any) -> None:
+        try:
+            self._service.send_response(response, header)
+        except Exception as error:  # its client may have gone
+            self._log(error)
+
+    def _log(self, error: Exception) -> None:
+        self._node.get_logger().error(
+            f'{self._service.srv_name}: {type(error).__name__}: {escaped(error)}')
+
     def _run(self) -> None:
         context = self._node.context
         while not self._ended.is_set() and context.ok():
@@ -92,8 +102,7 @@ class DeferredService:
                     self._take_one()
             except Exception as error:
                 if context.ok():
-                    self._node.get_logger().error(
-                        f'{self._service.srv_name}: {type(error).__name__}: {escaped(error)}')
+                    self._log(error)
                     self._ended.wait(1)  # whatever it is, it may last
 
     def _take_one(self) -> bool:
@@ -102,5 +111,5 @@ class DeferredService:
             request, header = handle.service_take_request(
                 self._service.srv_type.Request)  # type: ignore[attr-defined]
         if header is not None:
-            self._take(request, lambda response: self._service.send_response(response, header))
+            self._take(request, lambda response: self._send(response, header))
         return header is not None

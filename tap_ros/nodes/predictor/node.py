@@ -140,7 +140,7 @@ class PredictorNode(LifecycleBase):
             task = self._reader.read(request, predictor)
             queue.put(task, lambda found: self._answer(task, found, send, begin))
         except Exception as error:
-            self._send(send, self._refusal(error))
+            self._refuse(send, error)
 
     # In the thread of the queue
 
@@ -154,31 +154,24 @@ class PredictorNode(LifecycleBase):
             # Where to go first: the earliest subgoal of the first sample.
             shown = task, found[0][0], response.subgoals[0]
         except Exception as error:
-            self._send(send, self._refusal(error))
+            self._refuse(send, error)
             return
-        self._send(send, response)
+        send(response)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         self._unshown.append(shown)
 
     # In any of them
 
-    def _refusal(self, error: Exception) -> PredictSubgoal.Response:
-        """Return the response that names an error, and log it."""
+    def _refuse(self, send: Send, error: Exception) -> None:
+        """Send the response that names an error, and log it."""
         if isinstance(error, Busy):
             self.get_logger().warning(f'predict_subgoal: {error}', throttle_duration_sec=1.0)
         elif isinstance(error, TapError):
             self.get_logger().warning(f'predict_subgoal refused: {error}')
         else:
             self._diagnostics.error(error)
-        return PredictSubgoal.Response(
-            success=False, message=reason(self, 'predict_subgoal', error))
-
-    def _send(self, send: Send, response: PredictSubgoal.Response) -> None:
-        """Send a response; its client may have gone."""
-        try:
-            send(response)
-        except Exception as error:
-            log_error(self, 'predict_subgoal: a response cannot be sent', error)
+        send(PredictSubgoal.Response(
+            success=False, message=reason(self, 'predict_subgoal', error)))
 
 
 def predict(predictor: Predictor, tasks: list[requests.PendingRequest]) -> list[Found]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tap_ros.base.errors import ConfigError, RecordingError, StorageError
@@ -244,12 +244,9 @@ class RecorderNode(Node):
     def _on_message(self, topic: str, type_name: str, data: bytes, info: dict[str, Any]) -> None:
         self._diagnostics.received(topic)
         asked = self._recorded[topic].qos
-        latched = asked.durability == TRANSIENT_LOCAL
-        qos = Qos(
-            depth=1 if latched else 10,
-            durability='transient_local' if latched else 'volatile',
-            reliability='reliable' if asked.reliability == ReliabilityPolicy.RELIABLE
-            else 'best_effort')
+        qos = Qos(depth=1 if asked.durability == TRANSIENT_LOCAL else 10,
+                  durability=asked.durability.name.lower(),
+                  reliability=asked.reliability.name.lower())
         received = info['received_timestamp'] or time.time_ns()
         try:
             self._bags.take(topic, type_name, data, qos, received,

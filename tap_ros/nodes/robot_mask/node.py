@@ -26,7 +26,7 @@ from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
 from tap_ros.ros.calls import log_error
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
-from tap_ros.ros.parameters import declared_mount, Parameters, setting
+from tap_ros.ros.parameters import CameraParameters, declared_mount, Parameters, setting
 from tap_ros.ros.subscriptions import (
     adapt_regularly,
     AdaptiveSubscription,
@@ -207,7 +207,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters = Parameters(node)
     parameters.declare_shared('joint_prefix')
     parameters.declare_fields(RobotMaskParameters)
-    parameters.declare_camera('base_frame')
+    parameters.declare_fields(CameraParameters)
     named = parameters['urdf'] in names('tap_ros.arms')
     parameters.declare_mount(parameters['urdf'] if named else DEFAULT_ARM)
     return parameters

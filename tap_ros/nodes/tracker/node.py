@@ -26,7 +26,7 @@ from tap_ros.nodes.tracker.inputs import TrackerInputs
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.ros.calls import answering, log_error
 from tap_ros.ros.observations import Moment
-from tap_ros.ros.parameters import Parameters, setting
+from tap_ros.ros.parameters import CameraParameters, Parameters, setting
 from tap_ros.ros.subscriptions import Publishers, rivals
 from tap_ros.ros.topics import encode_objects, LATCHED, SERVICE_QOS, STREAM
 from tap_ros.tracking.plane import MIDDLE, Plane
@@ -337,6 +337,6 @@ def declare_parameters(node: Node) -> Parameters:
     parameters = Parameters(node)
     parameters.declare_fields(TrackerParameters)
     parameters.declare_shared('image_transport', 'joint_prefix', robot_mask='all')
-    parameters.declare_camera(f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
+    parameters.declare_fields(CameraParameters)
     parameters.declare_arm()
     return parameters
