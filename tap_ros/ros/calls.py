@@ -3,7 +3,6 @@
 """Calls with a time-out, services that answer whatever happens, and nodes that are spun."""
 
 from collections.abc import Callable
-from contextlib import suppress
 import inspect
 import threading
 import time
@@ -18,6 +17,7 @@ from rclpy.task import Future
 from tap_ros.base.errors import TapError
 from tap_ros.base.text import escaped
 from tap_ros.ros.heartbeat import Liveness
+from tap_ros.ros.polling import PollOnlyGroup, take_answers
 
 POLL_S = 0.05  # between two looks at whether a server is still there
 DRAIN_S = 0.2  # that what was sent before may take to arrive
@@ -85,28 +85,38 @@ class Spinner:
     A thread that keeps spinning answers ten times faster than spinning once per call.
 
     :param node: rclpy Node; destroying it stays with the caller.
+    :ivar answers: callback group of service clients whose answers another thread takes.
     """
 
     def __init__(self, node: Node) -> None:
-        self._node, self._stop = node, threading.Event()
+        self._node, self._stop, self.answers = node, threading.Event(), PollOnlyGroup()
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._thread = threading.Thread(target=self._run, name='spinner', daemon=True)
+        self._threads = [
+            threading.Thread(target=self._repeat, args=do, name=name, daemon=True)
+            for name, *do in (('spinner', self._executor.spin_once, 0.1),
+                              ('answers', take_answers, node, self.answers))]
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        self._executor.wake()
-        self._thread.join(timeout=5.0)
+        for thread in self._threads:
+            thread.join(timeout=5.0)
         self._executor.shutdown(timeout_sec=1.0)
 
-    def _run(self) -> None:
-        with suppress(ExternalShutdownException):
-            while not self._stop.is_set():
-                spin_once(self._executor, self._node)
+    def _repeat(self, do: Callable[..., object], *what: Any) -> None:
+        """Do something until the end, whatever it raises: a node whose thread ends is deaf."""
+        while not self._stop.is_set():
+            try:
+                do(*what)
+            except (InvalidHandle, ExternalShutdownException):
+                self._stop.wait(0.001)  # another thread has destroyed something just now
+            except Exception as error:
+                log_error(self._node, 'a callback failed; the node goes on', error)
 
 
 def call(client: Client, request: Any, timeout_s: float,

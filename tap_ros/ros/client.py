@@ -73,6 +73,7 @@ class Client:
     :param namespace: of the nodes.
     :param timeout_s: most seconds of a call that is given no other time-out.
     :param node: rclpy Node that another thread spins, to use instead of one of its own.
+    :ivar answers: callback group of service clients.
     """
 
     def __init__(self, namespace: str = '', timeout_s: float = 20.0,
@@ -95,6 +96,7 @@ class Client:
             self._spinner.__enter__()
         self.node = node
         self._group = ReentrantCallbackGroup()
+        self.answers = self._group if self._context is None else self._spinner.answers
         self._views = Views(node, self._group)
         self._lock = threading.RLock()
         self._made: dict[str, Any] = {}  # what was asked for so far
@@ -307,8 +309,6 @@ class Client:
         """Return the newest goal picture, as camera does."""
         return self._views.wait('goal', after_ns, objects, self._timeout(timeout_s))
 
-    # What is made when it is asked for first
-
     def _once(self, name: str, make: Callable[[], Any]) -> Any:
         with self._lock:
             if name not in self._made:
@@ -322,13 +322,13 @@ class Client:
         kind, topic, server = SERVICES[name]
         self._liveness(server)  # its heartbeat is heard from now on
         return self._once(topic, lambda: self.node.create_client(
-            kind, topic, qos_profile=SERVICE_QOS, callback_group=self._group))
+            kind, topic, qos_profile=SERVICE_QOS, callback_group=self.answers))
 
     @property
     def goals(self) -> Goals:
         """What sends goals."""
         made: Goals = self._once('goals', lambda: Goals(
-            self.node, self._liveness(PLANNER), self._group))
+            self.node, self._liveness(PLANNER), self._group, self.answers))
         return made
 
     def _liveness(self, name: str) -> Any:

@@ -43,13 +43,14 @@ class Goals:
 
     :param node: rclpy Node that another thread spins.
     :param server: Liveness of the planner.
-    :param group: callback group of the action, and of the service that cancels.
+    :param group: callback group of the action; answers: of the service that cancels.
     """
 
-    def __init__(self, node: Node, server: Liveness, group: CallbackGroup) -> None:
+    def __init__(self, node: Node, server: Liveness, group: CallbackGroup,
+                 answers: CallbackGroup) -> None:
         self.node, self.server, self._group = node, server, group
         self.renew()
-        self.cancels = node.create_client(CancelGoal, CANCEL, callback_group=group)
+        self.cancels = node.create_client(CancelGoal, CANCEL, callback_group=answers)
         self.open: set[Reaching] = set()  # that have not ended
         self.given_up, self.closed = threading.Event(), threading.Event()
         threading.Thread(target=self._cancel, name='cancelling', daemon=True).start()

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests that a thread of its own takes, whatever the executor does."""
+"""Requests and answers that threads of their own take, whatever the executors do."""
 
 from threading import Event
 
@@ -26,12 +26,14 @@ class Deferring(Node):
         self.service.close()
 
 
-def test_requests_are_taken_and_answered_while_the_executor_is_busy():
+def test_requests_and_answers_are_taken_while_executors_are_busy():
     free = Event()
     server = LocalNode(lambda **options: Deferring(free, **options))
     waiting = server.node.waiting
     with tap_ros.Client() as client:
-        asked = client.node.create_client(SetBool, 'deferred', qos_profile=SERVICE_QOS)
+        asked = client.node.create_client(
+            SetBool, 'deferred', qos_profile=SERVICE_QOS, callback_group=client.answers)
+        client.node.create_timer(0.01, lambda: free.wait(60))
         assert asked.wait_for_service(30)
         futures = [asked.call_async(SetBool.Request(data=True)) for _ in range(3)]
         assert not waiting  # the service has not begun

@@ -247,7 +247,8 @@ def ask_many(clients, seconds, depth, barrier, results):
 def make_client(client, depth):
     """Return a further rclpy client of the predictor, with a queue of its own."""
     return client.node.create_client(
-        PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth))
+        PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth),
+        callback_group=client.answers)
 
 
 @contextlib.contextmanager
