@@ -3,7 +3,6 @@
 """Calls with a time-out, services that answer whatever happens, and nodes that are spun."""
 
 from collections.abc import Callable
-import inspect
 import threading
 import time
 import traceback
@@ -20,7 +19,6 @@ from tap_ros.ros.heartbeat import Liveness
 from tap_ros.ros.polling import PollOnlyGroup, take_answers
 
 POLL_S = 0.05  # between two looks at whether a server is still there
-DRAIN_S = 0.2  # that what was sent before may take to arrive
 
 
 class CallError(TapError):
@@ -44,38 +42,26 @@ def reason(node: Node, what: str, error: Exception) -> str:
 
 
 def answering(node: Node, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """
-    Wrap the callback of a service so that any exception becomes a refusal with its reason.
-
-    :param callback: function or coroutine function.
-    """
-    async def answer(request: Any, response: Any) -> Any:
+    """Wrap the callback of a service so that any exception becomes a refusal with its reason."""
+    def answer(request: Any, response: Any) -> Any:
         try:
-            found = callback(request, response)
-            return await found if inspect.isawaitable(found) else found
+            return callback(request, response)
         except Exception as error:
             return type(response)(success=False, message=reason(node, 'service', error))
 
     return answer
 
 
-def spin_once(executor: Executor, node: Node, timeout_s: float = 0.1) -> None:
-    """Run what is ready, within the time; a callback that raises is logged, and ends no node."""
+def spin_once(executor: Executor, node: Node) -> None:
+    """Run what is ready, within 0.1 s; a callback that raises is logged, and ends no node."""
     try:
-        executor.spin_once(timeout_sec=timeout_s)
+        executor.spin_once(timeout_sec=0.1)
     except ExternalShutdownException:
         raise
     except InvalidHandle:  # of what another thread destroyed just now
         pass
     except Exception as error:
         log_error(node, 'a callback failed; the node goes on', error)
-
-
-def drain(node: Node) -> None:
-    """Run the callbacks of what came before a node ends, once its executor has stopped."""
-    deadline = time.monotonic() + DRAIN_S
-    while node.executor and node.context.ok() and (left := deadline - time.monotonic()) > 0:
-        spin_once(node.executor, node, left)
 
 
 class Spinner:

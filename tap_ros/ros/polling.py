@@ -7,7 +7,7 @@ An executor looks at everything that its node has, three times for a request or 
 Python's lock, and an answer comes to all clients of its service. While 30 pictures a second come,
 an answer of predict_subgoal by executors takes 1 to 2 ms longer and half as much CPU time again,
 and 16 clients get about half as many. So this file, and no other, uses what rclpy does not
-promise: handles, and wait sets made of them.
+promise: handles, and wait sets made of them. A recorder ends with what waits, by them, too.
 """
 
 from collections.abc import Callable, Sequence

@@ -9,10 +9,8 @@ from pathlib import Path
 import time
 from typing import Any
 
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tap_ros.base.errors import ConfigError, RecordingError, StorageError
 from tap_ros.base.files import free_folder
@@ -20,9 +18,10 @@ from tap_ros.base.text import escaped
 from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
 from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.recording.writer import BagWriter
-from tap_ros.ros.calls import answering, drain, DRAIN_S
+from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.parameters import declared_mount, Parameters, setting
+from tap_ros.ros.polling import take_messages
 from tap_ros.ros.subscriptions import AdaptiveSubscription, steady_timer
 from tap_ros.ros.topics import camera_image, message_class, SERVICE_QOS
 
@@ -181,7 +180,7 @@ class RecorderNode(Node):
             self._bags.start()
         self._subscribe_known()
         self.create_service(SetBool, 'recorder/record', answering(self, self._on_record),
-                            qos_profile=SERVICE_QOS, callback_group=ReentrantCallbackGroup())
+                            qos_profile=SERVICE_QOS)
         steady_timer(self, 0.5, self._on_timer)
         self.get_logger().info(
             f'ready: recording to {escaped(self._bags.folder)}' if self._bags.folder
@@ -189,24 +188,20 @@ class RecorderNode(Node):
 
     def close(self) -> int:
         """Finish the bag; return the exit code, 1 when the last bag is incomplete."""
-        drain(self)  # what has arrived, such as the end of an episode, is recorded
         self._finish()
         return int(self._bags.failure is not None)
 
     def _finish(self) -> str:
-        """Finish the bag; return a report for people."""
+        """Record what has arrived, such as the end of an episode, and finish the bag."""
+        for one in self._recorded.values():
+            for message, info in take_messages(one.subscription, DEPTH):
+                one.subscription.callback(message, info)
         recorded, text = self._bags.folder, self._bags.finish()
         if recorded and self._bags.failure is None:
             self.get_logger().info(f'recorded {text}')
         return text
 
-    async def _on_record(self, request: SetBool.Request,
-                         response: SetBool.Response) -> SetBool.Response:
-        if not request.data:  # what was sent before is recorded
-            arrived: Future = Future()
-            timer = steady_timer(self, DRAIN_S, lambda: arrived.set_result(None))
-            await arrived
-            self.destroy_timer(timer)
+    def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         response.message = (f'recording to {escaped(self._bags.start())}' if request.data
                             else self._finish())
         response.success = self._bags.failure is None
