@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from sim_bridge.demonstrations import demonstrate, Demonstration
 from sim_bridge.gym_world import GymWorld
-from sim_bridge.world.camera import Camera, drawing
+from sim_bridge.world.camera import Camera, plain_renderer
 from tap_ros.base.contract import (
     CONTROL_PERIOD,
     ROBOT_MASK_ARM,
@@ -60,11 +60,7 @@ class MetaWorld(GymWorld):
             eye = model.cam(name)
             eye.pos[:], eye.fovy[:] = np.array(camera.position) * TURN + ORIGIN, camera.fovy
             eye.quat[:] = replace(camera, turn=camera.turn + np.pi).quaternion
-        model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0  # 7 ms instead of 300
-        with drawing():
-            self._renderer = mujoco.Renderer(model, image_size, image_size)
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._renderer = plain_renderer(model, image_size)
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # the goal is drawn as a site
         self._labels = _labels(model)

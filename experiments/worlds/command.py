@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 import cv2
 from experiments.pages import render
+from experiments.worlds.ogbench import OGBench
 from experiments.worlds.trained import (
     held_out_of,
     mark,
@@ -109,7 +110,8 @@ def score_tasks(tasks, methods, args, prefix=''):
                                         (held_out_of(folder), HELD_OUT, first + 10 ** 6)):
                 collect(bag, CollectConfig(
                     world=world, task=task, episodes=episodes, seed=seed,
-                    image_size=args.image_size, episodes_per_file=10), args.engine)
+                    image_size=args.image_size, episodes_per_file=10), args.engine,
+                    make=OGBench if world == 'ogbench' else None)
         training, held_out = map(read, (folder, held_out_of(folder)))
         strips.append(strip(held_out[0]))
         for seed in range(args.seeds):

@@ -16,10 +16,10 @@ import cv2
 from experiments.pages import render, share
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import Method
+from experiments.worlds.pushes import push_to_goal, WORLDS
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
-from sim_bridge.gym_pushes import push_to_goal
 from sim_bridge.world_protocol import make_world
 from tap_ros.apps.train import train
 from tap_ros.base.contract import ACTION_LIMIT, step_budget
@@ -104,8 +104,8 @@ def make_weights(args):
     for task, folder in bags.items():
         for pushes, seed in BAGS.items():
             collect(folder / pushes, CollectConfig(
-                world=WORLD, task=task, episodes=args.episodes, seed=seed, pushes=pushes,
-                image_size=IMAGE_SIZE, episodes_per_file=10), args.engine)
+                world=f'{WORLD} {pushes}', task=task, episodes=args.episodes, seed=seed,
+                image_size=IMAGE_SIZE, episodes_per_file=10), args.engine, make=WORLDS[pushes])
     weights = {'forward': str(train(
         [folder / name for folder in bags.values() for name in BAGS],
         Path(args.runs, 'forward'), 'forward', steps=args.steps, **FORWARD))}

@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from sim_bridge.tasks.tasks import (
     carry_out,
-    Demonstration,
+    DemonstrationOptions,
     EpisodeRun,
     moves,
     straight,
@@ -117,7 +117,7 @@ class GraspTask(Task):
         return bool(high.all() and table.touching())
 
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
-                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+                    rng: np.random.Generator, how: DemonstrationOptions) -> EpisodeRun:
         """Act for exactly so many frames."""
         expert = GraspExpert(table, rng, lifts=self.lifts)
         num_frames = how.num_frames or self.num_frames

@@ -40,7 +40,7 @@ from sim_bridge.tasks.pushes import (
 from sim_bridge.tasks.tasks import (
     apart,
     carry_out,
-    Demonstration,
+    DemonstrationOptions,
     EpisodeRun,
     moves,
     Task,
@@ -102,7 +102,7 @@ class PushTask(Task):
         return gripper
 
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
-                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+                    rng: np.random.Generator, how: DemonstrationOptions) -> EpisodeRun:
         """Push, from the first motion of the arm to the last of an object."""
         natural = how.timing == 'natural'
         num_frames = how.num_frames or self.num_frames + (0 if natural else MORE_FRAMES)

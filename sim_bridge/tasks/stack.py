@@ -17,7 +17,7 @@ from sim_bridge.tasks.grasp import GRASP_HEIGHT, GRASP_YAW, GraspConfig, GraspEx
 from sim_bridge.tasks.tasks import (
     apart,
     carry_out,
-    Demonstration,
+    DemonstrationOptions,
     EpisodeRun,
     moves,
     straight,
@@ -74,7 +74,7 @@ class StackTask(Task):
         return is_tower(table.object_poses()) and not table.touching()
 
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
-                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+                    rng: np.random.Generator, how: DemonstrationOptions) -> EpisodeRun:
         """Act until the last block is let go; the outcome is that after SETTLE_STEPS more."""
         mover = PickAndPlace(table, rng)
         plans = (plan for k in scene.order

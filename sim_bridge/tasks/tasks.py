@@ -34,7 +34,7 @@ class TaskScene(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Demonstration:
+class DemonstrationOptions:
     """
     How an expert is to act.
 
@@ -100,7 +100,7 @@ class Task:
         return bool((table.distances() < SUCCESS_DISTANCE).all())
 
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
-                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+                    rng: np.random.Generator, how: DemonstrationOptions) -> EpisodeRun:
         """Let the expert act from the start of a scene, of which `first` is seen."""
         raise NotImplementedError
 
@@ -155,12 +155,12 @@ def run_episode(simulator: Any, seed: int, num_frames: int = 0, timing: str = 'n
 
     :param simulator: Simulator; reset here.
     :param seed: of the scene and of the expert.
-    :param num_frames: and the others: see Demonstration.
+    :param num_frames: and the others: see DemonstrationOptions.
     """
     task, first = simulator.task, simulator.reset(seed)
     return task.demonstrate(simulator, simulator.scene, first,
                             np.random.default_rng([seed, task.stream, 1]),
-                            Demonstration(num_frames, timing, misses))
+                            DemonstrationOptions(num_frames, timing, misses))
 
 
 def carry_out(table: Table, succeeds: Callable[[Table], bool], first: Observation,

@@ -132,6 +132,16 @@ def drawing() -> Iterator[None]:
             'libegl1 libgl1-mesa-dri') from error
 
 
+def plain_renderer(model: mujoco.MjModel, size: int) -> mujoco.Renderer:
+    """Return a Renderer of square pictures without what is slow off-screen: 7 ms, not 300."""
+    model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
+    with drawing():
+        renderer = mujoco.Renderer(model, size, size)
+    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        renderer.scene.flags[flag] = False
+    return renderer
+
+
 class OpenGL:
     """
     An off-screen OpenGL context; it belongs to the thread that built it.

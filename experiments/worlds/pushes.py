@@ -1,22 +1,19 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Pushes in a GymWorld with one object that slides, as the planner acts there.
+Pushes in Meta-World where one object slides, recorded as the planner acts there.
 
 Demonstrations bring the object to its goal by straight pushes that vary as a person's do; from
 them a predictor learns. Pushes at random hit, graze and miss it: what a forward model has to tell
 apart. Where objects are is ground truth, and labelled so.
 """
 
-from collections.abc import Callable, Iterator
-
 import numpy as np
-from sim_bridge.demonstrations import to_episode
-from sim_bridge.gym_world import GymWorld
+from sim_bridge.demonstrations import Demonstration, to_episode
+from sim_bridge.metaworld import MetaWorld
 from sim_bridge.tasks.pushes import Push, push_actions
 from tap_ros.base.contract import LIFTED
 from tap_ros.base.errors import SceneError
-from tap_ros.recording.episode import Episode
 
 TRIES = 20  # a scene without a goal is drawn anew
 MOST_PUSHES, RANDOM_PUSHES = 4, 3  # of an episode: of a demonstration, at random
@@ -29,8 +26,7 @@ ASIDE = 0.03  # rad and m, standard deviations of what demonstrations are off
 MISS = (0.3, 0.02)  # rad, m, of pushes at random
 
 
-def push_to_goal(world: GymWorld,
-                 rng: np.random.Generator | None = None) -> Iterator[np.ndarray]:
+def push_to_goal(world, rng=None):
     """
     Push the object of a World to its goal, as a script that knows both places.
 
@@ -54,7 +50,7 @@ def push_to_goal(world: GymWorld,
     yield np.array([0, 0, LIFTED - world.observe().gripper[2], 0])
 
 
-def push_about(world: GymWorld, rng: np.random.Generator) -> Iterator[np.ndarray]:
+def push_about(world, rng):
     """Push towards places at random, and past the object, too; see push_to_goal."""
     for _ in range(RANDOM_PUSHES):
         seen = world.observe()
@@ -66,29 +62,38 @@ def push_about(world: GymWorld, rng: np.random.Generator) -> Iterator[np.ndarray
             seen.gripper, here, goal) * (1, 1, 1, 0)
 
 
-POLICIES: dict[str, Callable[[GymWorld, np.random.Generator], Iterator[np.ndarray]]] = {
-    'goal': push_to_goal, 'random': push_about}
+class GoalPushes(MetaWorld):
+    """Meta-World whose expert pushes the object to its goal, with all that training takes."""
+
+    pushes = staticmethod(push_to_goal)
+
+    def demonstrate(self, seed, num_frames=0):
+        """
+        Push in a scene that is drawn from a seed; where it has no goal, another one is drawn.
+
+        :raises SceneError: if TRIES scenes in a row have no goal.
+        """
+        for attempt in range(TRIES):
+            rng = np.random.default_rng([seed, attempt])
+            try:
+                seen = [self.reset(int(rng.integers(2 ** 31)))]
+                break
+            except SceneError:
+                if attempt == TRIES - 1:
+                    raise
+        actions = []
+        for action in self.pushes(self, rng):
+            actions.append(action)
+            seen.append(self.step(action))
+        done = np.array([*actions, np.zeros(4)], np.float32)
+        return Demonstration(
+            to_episode(seen, done, self.goal(), self.task_name, seed, self.outcome()))
 
 
-def record_pushes(world: GymWorld, seed: int, policy: str) -> Episode:
-    """
-    Push in a scene that is drawn from a seed; where it has no goal, another one is drawn.
+class RandomPushes(GoalPushes):
+    """Meta-World whose expert pushes about."""
 
-    :param policy: one of POLICIES.
-    :return: Episode, with all that training takes.
-    :raises SceneError: if TRIES scenes in a row have no goal.
-    """
-    for attempt in range(TRIES):
-        rng = np.random.default_rng([seed, attempt])
-        try:
-            seen = [world.reset(int(rng.integers(2 ** 31)))]
-            break
-        except SceneError:
-            if attempt == TRIES - 1:
-                raise
-    actions = []
-    for action in POLICIES[policy](world, rng):
-        actions.append(action)
-        seen.append(world.step(action))
-    done = np.array([*actions, np.zeros(4)], np.float32)
-    return to_episode(seen, done, world.goal(), world.task_name, seed, world.outcome())
+    pushes = staticmethod(push_about)
+
+
+WORLDS = {'random': RandomPushes, 'goal': GoalPushes}
