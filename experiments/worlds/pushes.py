@@ -11,7 +11,7 @@ apart. Where objects are is ground truth, and labelled so.
 import numpy as np
 from sim_bridge.demonstrations import Demonstration, to_episode
 from sim_bridge.metaworld import MetaWorld
-from sim_bridge.tasks.pushes import Push, push_actions
+from sim_bridge.tasks.motions import Push, push_actions
 from tap_ros.base.contract import LIFTED
 from tap_ros.base.errors import SceneError
 

@@ -58,34 +58,27 @@ class ObjectShape:
     colours: tuple[tuple[float, ...], ...]  # per part: (r, g, b)
 
 
-def random_shape(rng: np.random.Generator) -> ObjectShape:
+def random_shape(rng: np.random.Generator, thin: bool = False) -> ObjectShape:
     """
     Draw a shape and its colours.
 
     :param rng: numpy Generator.
+    :param thin: so that fingers can hold it.
     :return: ObjectShape with its centre of area at the origin.
     """
     kind = SHAPES[rng.choice(len(SHAPES), p=(0.35, 0.35, 0.15, 0.15))]
     colours = tuple(tuple(rng.uniform(0.3, 1.0, 3)) for _ in range(2))
     if kind == 'disc':
-        return ObjectShape(kind, ((rng.uniform(0.04, 0.06), HALF_HEIGHT),), ((0, 0),), colours[:1])
-    return box_shape(
-        kind, HALF_THICKNESS, rng.uniform(0.05, 0.09), rng.uniform(0.02, 0.05), colours)
-
-
-def box_shape(kind: str, thickness: float, length: float, arm_length: float,
-              colours: tuple[tuple[float, ...], ...]) -> ObjectShape:
-    """
-    Make a bar along y, and its arm for an L or a T; all lengths are halves, in metres.
-
-    :return: ObjectShape with its centre of area at the origin.
-    """
-    bar = (thickness, length, HALF_HEIGHT)
+        radius = rng.uniform(0.02, 0.028) if thin else rng.uniform(0.04, 0.06)
+        return ObjectShape(kind, ((radius, HALF_HEIGHT),), ((0, 0),), colours[:1])
+    # A bar along y, and its arm for an L or a T; all lengths are halves.
+    thickness = rng.uniform(0.014, 0.018) if thin else HALF_THICKNESS
+    bar = (thickness, rng.uniform(0.06 if thin else 0.05, 0.09), HALF_HEIGHT)
+    arm = (rng.uniform(0.03 if thin else 0.02, 0.05), thickness, HALF_HEIGHT)
     if kind == 'bar':
         return ObjectShape(kind, (bar,), ((0, 0),), colours[:1])
-    arm = (arm_length, thickness, HALF_HEIGHT)
     # The arm sticks out from the bar's side: at its end for L, its middle for T.
-    arm_centre = np.array([thickness + arm_length, length - thickness if kind == 'L' else 0.0])
+    arm_centre = np.array([thickness + arm[0], bar[1] - thickness if kind == 'L' else 0.0])
     areas = np.array([bar[0] * bar[1], arm[0] * arm[1]])
     centroid = arm_centre * areas[1] / areas.sum()
     return ObjectShape(kind, (bar, arm), (tuple(-centroid), tuple(arm_centre - centroid)), colours)

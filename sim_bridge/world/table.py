@@ -39,13 +39,6 @@ OBSERVER_SIZE = 384  # pixels of the picture for people
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
 
 
-def divided(actions: np.ndarray, limit: Sequence[float]) -> np.ndarray:
-    """Return actions (n, 4) with every one whose move exceeds (3,) m in several equal parts."""
-    parts = np.ceil((np.abs(actions[:, :3]) / limit).max(1, initial=0) - 1e-6).astype(int)
-    parts = np.maximum(parts, 1)
-    return np.repeat(actions / np.stack([parts, parts, parts, np.ones_like(parts)], 1), parts, 0)
-
-
 def ramp_controls(target: np.ndarray, actions: np.ndarray,
                   low: Sequence[float] = WORKSPACE_LOW, high: Sequence[float] = WORKSPACE_HIGH,
                   ) -> tuple[np.ndarray, np.ndarray]:
@@ -70,6 +63,17 @@ def ramp_controls(target: np.ndarray, actions: np.ndarray,
     fingers = path[..., 3:] * FINGER_TRAVEL
     controls = np.concatenate([path[..., :3], fingers, fingers], axis=-1)
     return controls.reshape(*actions.shape[:-2], -1, 5), targets
+
+
+def objects_in(states: np.ndarray, model: mujoco.MjModel) -> np.ndarray:
+    """Return (..., K, 7) x, y, z in m, quaternion w, x, y, z in states (..., S) of the physics."""
+    poses = states[..., 1 + OBJECT_QPOS_START:1 + model.nq]  # after the time
+    return poses.reshape(*poses.shape[:-1], -1, 7)
+
+
+def upright(objects: np.ndarray) -> np.ndarray:
+    """Return the cosines (...) of tilts; objects (..., 7) as objects_in."""
+    return 1 - 2 * (objects[..., 4] ** 2 + objects[..., 5] ** 2)
 
 
 class Table(OneCamera):
