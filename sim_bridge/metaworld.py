@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from sim_bridge.demonstrations import demonstrate, Demonstration
 from sim_bridge.gym_world import GymWorld
-from sim_bridge.world.camera import Camera, plain_renderer
+from sim_bridge.world.camera import Camera, Renderer
 from tap_ros.base.contract import (
     CONTROL_PERIOD,
     ROBOT_MASK_ARM,
@@ -60,7 +60,7 @@ class MetaWorld(GymWorld):
             eye = model.cam(name)
             eye.pos[:], eye.fovy[:] = np.array(camera.position) * TURN + ORIGIN, camera.fovy
             eye.quat[:] = replace(camera, turn=camera.turn + np.pi).quaternion
-        self._renderer = plain_renderer(model, image_size)
+        self._renderer = Renderer(model, image_size, image_size)
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # the goal is drawn as a site
         self._labels = _labels(model)

@@ -10,7 +10,7 @@ from importlib import import_module
 
 import numpy as np
 from sim_bridge.demonstrations import demonstrate
-from sim_bridge.world.camera import Camera, plain_renderer
+from sim_bridge.world.camera import Camera, Renderer
 from tap_ros.base.errors import ConfigError, SceneError
 
 TASKS = ('button', 'cube', 'drawer', 'window')
@@ -40,7 +40,7 @@ class OGBench:
         self._info = {}
         self.env.reset(seed=0)  # it makes the model
         self.camera_matrix = Camera(image_size, image_size, fovy=FOVY).K
-        self._renderer = plain_renderer(self.env._model, image_size)
+        self._renderer = Renderer(self.env._model, image_size, image_size)
 
     demonstrate = demonstrate
 

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import mujoco
 import numpy as np
-from sim_bridge.world.camera import Camera, OpenGL
+from sim_bridge.world.camera import Camera, Renderer
 from sim_bridge.world.looks import Appearance, USUAL
 from sim_bridge.world.scene import ARM_GEOM_GROUP
 from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
@@ -24,7 +24,7 @@ from tap_ros.base.errors import SceneError
 from tap_ros.robots.arm import Arm
 
 SAMPLES = 2  # along each side of a pixel
-MAX_GEOMS = 400
+MOST_GEOMS = 400  # with shadows
 TABLE_HALF = 0.57  # m, of the table's square top
 RIM = (0.015, 0.02)  # m: half its width, its height
 FLOOR = -0.75  # m
@@ -49,13 +49,9 @@ class Studio:
         width, height = samples * camera.width, samples * camera.height
         self._joints = np.zeros(len(arm.joints))
         self._model = _studio_model(arm if links else None)
-        self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         self._table_colour = self._model.mat('table').rgba.copy()
         self._data = mujoco.MjData(self._model)
-        self._gl = OpenGL(self._model, width, height)
-        self._scene = mujoco.MjvScene(self._model, MAX_GEOMS)
-        self._eye = mujoco.MjvCamera()
-        self._eye.type, self._eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        self._renderer = Renderer(self._model, width, height, MOST_GEOMS)
         self._show, self._hide = mujoco.MjvOption(), mujoco.MjvOption()
         self._hide.geomgroup[ARM_GEOM_GROUP] = 0
         self._perturbation = mujoco.MjvPerturb()
@@ -94,16 +90,16 @@ class Studio:
             (J,) rad of the arm.
         """
         self._pose_arm(data.qpos[:3])
-        scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL
-        option = self._hide if hide_arm else self._show
-        mujoco.mjv_updateScene(
-            self._model, self._data, option, None, self._eye, everything, scene)
+        option, scene = self._hide if hide_arm else self._show, self._renderer.scene
+        self._renderer.update_scene(self._data, 'camera', option)
         own = scene.ngeom
         mujoco.mjv_addGeoms(self._physics, data, option, self._perturbation,
                             mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
-        colours = self._gl.draw(scene)
+        colours = self._renderer.render()
         labels = self._add_shadows(own)
-        numbers = self._gl.draw(scene, numbers=True)
+        self._renderer.enable_segmentation_rendering()
+        numbers = self._renderer.render()[..., 0]
+        self._renderer.disable_segmentation_rendering()
         # Shadows darken the table; light falls off at their edges as pixels are averaged.
         label, shadow = labels[numbers, 0], labels[numbers, 1]
         shade = np.where((shadow != 0) & self._table, 1 - SHADOW, 1).astype(np.float32)
@@ -115,7 +111,7 @@ class Studio:
 
     def close(self) -> None:
         """Free the OpenGL context."""
-        self._gl.close()
+        self._renderer.close()
 
     def _pose_arm(self, gripper: np.ndarray) -> None:
         """Let the arm carry the gripper at (3,) m."""
@@ -135,21 +131,22 @@ class Studio:
         :return: uint8 (N + 1, 2): for each geom of the scene the mask's label and whether it is a
             shadow; the last row is for pixels without a geom.
         """
-        scene, count = self._scene, self._scene.ngeom
+        scene = self._renderer.scene
+        count = scene.ngeom
         labels = np.zeros((2 * count + 1, 2), np.uint8)
         for i in range(count):
             geom = scene.geoms[i]
-            geom.segid = i
-            if i < own and self._model.geom_group[geom.objid] != ARM_GEOM_GROUP:
+            number, geom.segid, geom.objid = geom.objid, i, i
+            if i < own and self._model.geom_group[number] != ARM_GEOM_GROUP:
                 continue  # furniture
-            label = ROBOT_MASK_ARM if i < own else self._labels[geom.objid]
+            label = ROBOT_MASK_ARM if i < own else self._labels[number]
             shadow = scene.geoms[scene.ngeom]
             place = self._flatten @ geom.pos
             place[2] += SHADOW_HEIGHT
             mujoco.mjv_initGeom(shadow, geom.type, geom.size, place,
                                 (self._flatten @ geom.mat).ravel(), geom.rgba)
             shadow.size[:] = geom.size  # mjv_initGeom makes cylinders and capsules as long as wide
-            shadow.segid = scene.ngeom
+            shadow.segid = shadow.objid = scene.ngeom
             labels[i] = label, 0
             labels[scene.ngeom] = label, 1
             scene.ngeom += 1
