@@ -3,9 +3,8 @@
 """
 Pushes in Meta-World where one object slides, recorded as the planner acts there.
 
-Demonstrations bring the object to its goal by straight pushes that vary as a person's do; from
-them a predictor learns. Pushes at random hit, graze and miss it: what a forward model has to tell
-apart. Where objects are is ground truth, and labelled so.
+From demonstrations, straight pushes to the goal that vary as a person's do, a predictor learns;
+from pushes at random, which hit, graze and miss, a forward model. Objects are ground truth.
 """
 
 import numpy as np
@@ -15,7 +14,7 @@ from sim_bridge.tasks.motions import Push, push_actions
 from tap_ros.base.contract import LIFTED
 from tap_ros.base.errors import SceneError
 
-TRIES = 20  # a scene without a goal is drawn anew
+TRIES = 20  # a scene without a goal is drawn anew; the last one's error says why
 MOST_PUSHES, RANDOM_PUSHES = 4, 3  # of an episode: of a demonstration, at random
 REACH_LOW, REACH_HIGH = (-0.2, -0.28), (0.2, 0.12)  # m, in view: where to pushes at random lead
 TRAVEL = (0.06, 0.08)  # m per control period, while lifted
@@ -23,7 +22,7 @@ PUSHED = (0.025, 0.05)  # likewise, while low
 OVERSHOOT = -0.035  # m, of push_actions: these fingers and objects are small
 NEAR = 0.02  # m from its goal; an object that is nearer is left alone
 ASIDE = 0.03  # rad and m, standard deviations of what demonstrations are off
-MISS = (0.3, 0.02)  # rad, m, of pushes at random
+MISS = (0.3, 0.02, 0.03)  # rad, m, m: likewise, of pushes at random
 
 
 def push_to_goal(world, rng=None):
@@ -37,29 +36,29 @@ def push_to_goal(world, rng=None):
     for _ in range(MOST_PUSHES):
         seen = world.observe()
         here, goal = seen.object_poses[0, :2], world.goal_places()[0, :2]
-        gap = goal - here
-        if np.linalg.norm(gap) < NEAR:
+        if np.linalg.norm(goal - here) < NEAR:
             break
-        angle, speeds = np.arctan2(gap[1], gap[0]), (PUSHED[1], TRAVEL[1])
-        off = np.zeros(3)
+        off, speeds = np.zeros(3), (PUSHED[1], TRAVEL[1])
         if rng is not None:
             off = rng.normal(0, ASIDE, 3) * (2, 0.2, 0.3)
             speeds = rng.uniform(*PUSHED), rng.uniform(*TRAVEL)
-        yield from push_actions(Push(angle + off[0], off[1], OVERSHOOT + off[2], *speeds),
-                                seen.gripper, here, goal)[:, :4] * (1, 1, 1, 0)
+        yield from _push(off, speeds, seen.gripper, here, goal)
     yield np.array([0, 0, LIFTED - world.observe().gripper[2], 0])
 
 
 def push_about(world, rng):
     """Push towards places at random, and past the object, too; see push_to_goal."""
     for _ in range(RANDOM_PUSHES):
-        seen = world.observe()
-        here, goal = seen.object_poses[0, :2], rng.uniform(REACH_LOW, REACH_HIGH)
-        gap = goal - here
-        yield from push_actions(
-            Push(np.arctan2(gap[1], gap[0]) + rng.normal(0, MISS[0]), rng.normal(0, MISS[1]),
-                 OVERSHOOT + rng.normal(0, 0.03), rng.uniform(*PUSHED), rng.uniform(*TRAVEL)),
-            seen.gripper, here, goal) * (1, 1, 1, 0)
+        seen, goal = world.observe(), rng.uniform(REACH_LOW, REACH_HIGH)
+        off, speeds = rng.normal(0, MISS), (rng.uniform(*PUSHED), rng.uniform(*TRAVEL))
+        yield from _push(off, speeds, seen.gripper, seen.object_poses[0, :2], goal)
+
+
+def _push(off, speeds, hand, here, goal):
+    """Return a push, off by rad, m aside and m beyond; see motions.push_actions."""
+    x, y = goal - here
+    push = Push(np.arctan2(y, x) + off[0], off[1], OVERSHOOT + off[2], *speeds)
+    return push_actions(push, hand, here, goal) * (1, 1, 1, 0)
 
 
 class GoalPushes(MetaWorld):
@@ -68,26 +67,21 @@ class GoalPushes(MetaWorld):
     pushes = staticmethod(push_to_goal)
 
     def demonstrate(self, seed, num_frames=0):
-        """
-        Push in a scene that is drawn from a seed; where it has no goal, another one is drawn.
-
-        :raises SceneError: if TRIES scenes in a row have no goal.
-        """
+        """Push in a scene that is drawn from a seed, in the first of TRIES that has a goal."""
         for attempt in range(TRIES):
             rng = np.random.default_rng([seed, attempt])
             try:
-                seen = [self.reset(int(rng.integers(2 ** 31)))]
+                seen, actions = [self.reset(int(rng.integers(2 ** 31)))], []
                 break
             except SceneError:
                 if attempt == TRIES - 1:
                     raise
-        actions = []
         for action in self.pushes(self, rng):
             actions.append(action)
             seen.append(self.step(action))
-        done = np.array([*actions, np.zeros(4)], np.float32)
-        return Demonstration(
-            to_episode(seen, done, self.goal(), self.task_name, seed, self.outcome()))
+        return Demonstration(to_episode(
+            seen, np.array([*actions, np.zeros(4)], np.float32), self.goal(), self.task_name,
+            seed, self.outcome()))
 
 
 class RandomPushes(GoalPushes):

@@ -4,7 +4,7 @@
 
 from collections.abc import Iterator
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import os
 import warnings
 
@@ -88,15 +88,6 @@ class Camera:
             far = np.where(
                 rays[..., 2] < 0, (np.asarray(height) - self.position[2]) / rays[..., 2], np.inf)
             return np.array(self.position[:2]) + far[..., None] * rays[..., :2]
-
-    def moved(self, offset: tuple[float, float, float], tilt: float) -> 'Camera':
-        """Return this camera elsewhere, by m along x, y, z, and tilted upwards by rad."""
-        x, y, z = np.add(self.position, offset).tolist()
-        return replace(self, position=(x, y, z), tilt=self.tilt + tilt)
-
-    def resized(self, width: int, height: int) -> 'Camera':
-        """Return a camera with the same view and other pixels."""
-        return replace(self, width=width, height=height)
 
 
 class OneCamera:

@@ -124,13 +124,14 @@ def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False) -> mujoco
 def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, hand: Hand,
                  surface: dict[str, Any]) -> None:
     """Add the gripper on three slide joints, and two fingers that open along x."""
-    gripper = world.add_body(name='gripper', pos=[0, 0, FINGER_CLEARANCE], gravcomp=1)
+    gripper = world.add_body(
+        name='gripper', pos=[0, 0, FINGER_CLEARANCE], gravcomp=1, mass=0.5, inertia=[1e-3] * 3,
+        explicitinertial=True)
     arm = {'group': ARM_GEOM_GROUP, 'density': 0, **surface}
     gripper.add_geom(
         name='palm', type=mujoco.mjtGeom.mjGEOM_BOX, size=list(hand.palm),
         pos=[0, 0, 2 * hand.finger[2] + hand.palm[2]], rgba=[*hand.palm_colour, 1],
         contype=0, conaffinity=0, **arm)
-    gripper.mass, gripper.inertia, gripper.explicitinertial = 0.5, [1e-3, 1e-3, 1e-3], True
     # Weak downwards: fingers that come down on an object rest on it and do not shoot it away.
     for name, axis, limit in zip(GRIPPER_JOINTS[:3], np.eye(3), (30, 30, 8)):
         gripper.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=list(axis))
@@ -138,8 +139,7 @@ def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, hand: Hand,
     for side, sign in (('left', -1), ('right', 1)):
         finger = gripper.add_body(
             name=f'{side}_finger', pos=[sign * (hand.finger[0] + FINGER_GAP), 0, hand.finger[2]],
-            gravcomp=1)
-        finger.mass, finger.inertia, finger.explicitinertial = 0.05, [1e-4, 1e-4, 1e-4], True
+            gravcomp=1, mass=0.05, inertia=[1e-4] * 3, explicitinertial=True)
         # Fingers touch objects (bit 1), neither each other nor the table.
         finger.add_geom(
             name=f'{side}_finger', type=mujoco.mjtGeom.mjGEOM_BOX, size=list(hand.finger),
@@ -152,13 +152,9 @@ def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, hand: Hand,
 def _add_servo(spec: mujoco.MjSpec, joint: str, kp: float, kv: float, limit: float) -> None:
     """Add a position servo on a joint: force = kp (target - position) - kv velocity."""
     actuator = spec.add_actuator(
-        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        biastype=mujoco.mjtBias.mjBIAS_AFFINE)
-    actuator.gainprm[0] = kp
-    actuator.biasprm[1] = -kp
-    actuator.biasprm[2] = -kv
-    actuator.forcelimited = True
-    actuator.forcerange = [-limit, limit]
+        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, forcelimited=True,
+        forcerange=[-limit, limit])
+    actuator.set_to_position(kp=kp, kv=kv)
 
 
 def _add_object(world: mujoco.MjsBody, name: str, shape: ObjectShape) -> None:

@@ -12,6 +12,7 @@ the robot is. That takes a tenth of the time of shadow maps.
 """
 
 import contextlib
+from dataclasses import replace
 from functools import lru_cache
 
 import mujoco
@@ -62,7 +63,9 @@ class Studio:
         # What the mask says of each geom of the physics model.
         hand = physics.geom_group == ARM_GEOM_GROUP
         self._labels = np.where(hand, ROBOT_MASK_HAND, ROBOT_MASK_FREE).astype(np.uint8)
-        camera = self._camera.moved(appearance.camera_offset, appearance.camera_tilt)
+        usual = self._camera
+        camera = replace(usual, tilt=usual.tilt + appearance.camera_tilt, position=tuple(
+            np.add(usual.position, appearance.camera_offset).tolist()))
         model = self._model
         model.cam('camera').pos[:] = camera.position
         model.cam('camera').quat[:] = camera.quaternion
@@ -104,10 +107,15 @@ class Studio:
         label, shadow = labels[numbers, 0], labels[numbers, 1]
         shade = np.where((shadow != 0) & self._table, 1 - SHADOW, 1).astype(np.float32)
         shaded = colours * shade[..., None]
-        picture = sum(_samples(shaded, self._samples)) / self._samples ** 2
+        picture = sum(self._parts(shaded)) / self._samples ** 2
         # Of a pixel the robot's if one of its samples is.
-        mask = np.maximum.reduce(_samples(label, self._samples))
+        mask = np.maximum.reduce(self._parts(label))
         return np.rint(picture).astype(np.uint8), mask, self._joints.copy()
+
+    def _parts(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return the first sample of each pixel (H, W, ...), the second, and so on."""
+        side = self._samples
+        return [values[row::side, column::side] for row in range(side) for column in range(side)]
 
     def close(self) -> None:
         """Free the OpenGL context."""
@@ -156,7 +164,6 @@ class Studio:
 def _studio_model(arm: Arm | None) -> mujoco.MjModel:
     """Compile table, rim, floor, light, camera and perhaps the arm."""
     spec = mujoco.MjSpec()
-    spec.visual.quality.shadowsize = spec.visual.quality.offsamples = 0
     spec.visual.quality.numslices, spec.visual.quality.numstacks = 16, 8
     spec.visual.quality.numquads = 1
     spec.visual.map.znear, spec.visual.map.zfar = 0.1, 10
@@ -165,9 +172,9 @@ def _studio_model(arm: Arm | None) -> mujoco.MjModel:
     spec.visual.headlight.specular = [0, 0, 0]
     world = spec.worldbody
     world.add_camera(name='camera')
-    light = world.add_light(
-        name='light', pos=[0, 0, 3], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    light.castshadow, light.ambient, light.specular = False, [0, 0, 0], [0.12, 0.12, 0.12]
+    world.add_light(
+        name='light', pos=[0, 0, 3], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=False, ambient=[0, 0, 0], specular=[0.12, 0.12, 0.12])
     spec.add_texture(
         name='walls', type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=16, height=96,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=[0.78, 0.79, 0.8],
@@ -190,8 +197,8 @@ def _add_arm(spec: mujoco.MjSpec, arm: Arm) -> None:
     bodies = [body]
     for joint, link, (place, roll) in zip(arm.joints, arm.links[1:], arm.origins):
         body = body.add_body(
-            name=link, pos=place, quat=[np.cos(roll / 2), np.sin(roll / 2), 0, 0])
-        body.mass, body.inertia, body.explicitinertial = 1.0, [0.01] * 3, True
+            name=link, pos=place, quat=[np.cos(roll / 2), np.sin(roll / 2), 0, 0], mass=1.0,
+            inertia=[0.01] * 3, explicitinertial=True)
         body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
         bodies.append(body)
     for shape in arm.shapes:
@@ -209,9 +216,9 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
         name='wood', type=mujoco.mjtTexture.mjTEXTURE_2D, width=wood.shape[1],
         height=wood.shape[0], nchannel=3)
     texture.data = wood.tobytes()
-    material = spec.add_material(name='table', texrepeat=[1, 1], specular=0.1, shininess=0.2)
     # Half bright: factors of an Appearance above 1 have room.
-    material.rgba = [0.62, 0.62, 0.62, 1]
+    material = spec.add_material(name='table', texrepeat=[1, 1], specular=0.1, shininess=0.2,
+                                 rgba=[0.62, 0.62, 0.62, 1])
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = 'wood'
     world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[TABLE_HALF, TABLE_HALF, 0.1],
                    material='table')
@@ -252,13 +259,6 @@ def _wood(size: int = 256, planks: int = 7) -> np.ndarray:
 @lru_cache(4)
 def _sees_table(camera: Camera, samples: int) -> np.ndarray:
     """Say which samples of a picture look at the table's top: bool (H, W), of all samples."""
-    fine = camera.resized(samples * camera.width, samples * camera.height)
-    u, v = np.meshgrid(np.arange(fine.width), np.arange(fine.height))
-    place = fine.on_table(np.stack([u, v], -1))
-    return (np.abs(place) < TABLE_HALF).all(-1)
-
-
-def _samples(values: np.ndarray, samples: int) -> list[np.ndarray]:
-    """Return the first sample of each pixel (H, W, ...), the second, and so on."""
-    return [values[row::samples, column::samples]
-            for row in range(samples) for column in range(samples)]
+    fine = replace(camera, width=samples * camera.width, height=samples * camera.height)
+    pixels = np.stack(np.meshgrid(np.arange(fine.width), np.arange(fine.height)), -1)
+    return (np.abs(fine.on_table(pixels)) < TABLE_HALF).all(-1)

@@ -5,6 +5,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
+from dataclasses import replace
 
 import mujoco
 import mujoco.rollout
@@ -218,7 +219,7 @@ class Table(OneCamera):
     def observer_picture(self) -> np.ndarray:
         """Take the camera's picture with the whole arm, for people: uint8 (384, 384, 3) rgb."""
         if self._observer is None:
-            camera = self._usual_camera.resized(OBSERVER_SIZE, OBSERVER_SIZE)
+            camera = replace(self._usual_camera, width=OBSERVER_SIZE, height=OBSERVER_SIZE)
             self._observer = Studio(camera, self.arm, links=True, samples=1)
         self._observer.use(self.model, self._worn)
         return self._observer.render(self.data)[0]
