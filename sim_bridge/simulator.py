@@ -18,10 +18,21 @@ from tap_ros.robots.arm import DEFAULT_ARM
 
 class Simulator(Table):
     """
-    The World 'mujoco_table'.
+    The World 'mujoco_table': an arm with a gripper, K objects, a camera, a goal.
 
-    :param task: name of a task, see tasks.task_names; the others: see Table.
-    :raises SceneError: for an unknown task, and as Table.
+    Everything follows from seeds and actions, to the bit. Observations have shapes and units as
+    world_protocol.Observation says; it belongs to the thread of its first reset, which draws.
+
+    :param task: name of a task, such as 'push2'; see tasks.task_names.
+    :param image_size: width and height of the pictures, 16 to 1024 pixels.
+    :param look: 'hand' or 'arm', what pictures show of the arm.
+    :param appearance: of table, light and camera, one of looks.CHOICES; 'random': drawn from the
+        seed of each scene.
+    :param arm: name of an arm, such as 'ur10e'.
+    :ivar scene: the TaskScene of the last reset.
+    :raises ConfigError: for an unknown arm.
+    :raises SceneError: for an unknown task, look or appearance and a bad size; by reset also when
+        nothing can be rendered.
     """
 
     def __init__(self, task: str = 'push2', image_size: int = 64, look: str = DEFAULT_LOOK,

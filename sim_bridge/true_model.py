@@ -39,11 +39,11 @@ class TrueModel:
         """
         Take the table of a learned model's weights.
 
-        :raises ConfigError: without a simulator, that is, other than in an evaluation.
+        :raises ConfigError: without a simulator, that is, other than in an experiment.
         """
         if simulator is None:
-            raise ConfigError("forward model 'true': needs a simulator to roll out in; use it in "
-                              'evaluate planning, or make TrueModel(table, simulator)')
+            raise ConfigError("forward model 'true': needs a simulator to roll out in; make "
+                              'TrueModel(table, simulator)')
         return cls(LearnedForwardModel.load(path, device).table, simulator)
 
     def begin(self, image: torch.Tensor, gripper: torch.Tensor,

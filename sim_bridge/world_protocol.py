@@ -61,7 +61,12 @@ class World(Protocol):
     def camera_pose(self) -> np.ndarray | None: ...
 
     def reset(self, seed: int) -> Observation:
-        """Begin the scene of a seed, a non-negative integer, with its goal."""
+        """
+        Begin the scene of a seed, with its goal.
+
+        :param seed: integer from 0 on.
+        :raises SceneError: for another seed, and where a scene cannot be made or drawn.
+        """
 
     def step(self, action: ArrayLike) -> Observation:
         """

@@ -143,6 +143,14 @@ class Renderer(mujoco.Renderer):  # type: ignore[misc]  # MuJoCo has no types
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self.scene.flags[flag] = False
 
+    def numbers(self) -> np.ndarray:
+        """Return the number and kind of what is seen at each pixel, (H, W, 2); -1: nothing."""
+        self.enable_segmentation_rendering()
+        try:
+            return self.render()
+        finally:
+            self.disable_segmentation_rendering()
+
     def close(self) -> None:
         """Free what this holds; keep what another thread is drawing with."""
         try:

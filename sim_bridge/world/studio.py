@@ -100,9 +100,7 @@ class Studio:
                             mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
         colours = self._renderer.render()
         labels = self._add_shadows(own)
-        self._renderer.enable_segmentation_rendering()
-        numbers = self._renderer.render()[..., 0]
-        self._renderer.disable_segmentation_rendering()
+        numbers = self._renderer.numbers()[..., 0]
         # Shadows darken the table; light falls off at their edges as pixels are averaged.
         label, shadow = labels[numbers, 0], labels[numbers, 1]
         shade = np.where((shadow != 0) & self._table, 1 - SHADOW, 1).astype(np.float32)

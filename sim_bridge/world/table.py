@@ -79,19 +79,12 @@ def upright(objects: np.ndarray) -> np.ndarray:
 
 class Table(OneCamera):
     """
-    A table with a gripper, objects and a camera.
+    A table with a gripper, objects and a camera; see simulator.Simulator.
 
-    :param image_size: pixels of the square picture.
     :param gripping: the hand is one that grips, and the camera near.
-    :param look: name of a look, see looks.LOOKS.
-    :param appearance: name of an appearance, see appearance.CHOICES.
-    :param arm: name of an arm, see robots.arm.get_arm.
     :ivar goal_poses: (K, 7) where the objects shall be, as object_poses.
     :ivar object_names: K names, in the order of their poses.
     :ivar seed: of the scene.
-    :raises ConfigError: for an unknown arm.
-    :raises SceneError: for an unknown look or appearance, a bad size, or when nothing can be
-        rendered.
     """
 
     goal_poses: np.ndarray
