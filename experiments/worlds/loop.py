@@ -237,13 +237,12 @@ def write_results(runs, out, args):
 def summarise(rows):
     """Return a line for each task and method: shares and distances with 95% intervals."""
     found = []
-    for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
-        same = [row for row in rows if (row['task'], row['method']) == (task, method)]
+    for (task, method), same in pd.DataFrame(rows).groupby(['task', 'method'], sort=False):
         line = {'task': task, 'method': method, 'scenes': len(same)}
         for name in ('ends', 'ever'):
-            line[name] = share(share_interval([row[name] for row in same]))
+            line[name] = share(share_interval(same[name].tolist()))
         for name in ('start_cm', 'final_cm'):
-            value, low, high = mean_interval([row[name] for row in same])
+            value, low, high = mean_interval(same[name].tolist())
             line[name] = f'{value:.1f} ({low:.1f} to {high:.1f})'
-        found.append({**line, 'steps': f'{np.mean([row["steps"] for row in same]):.0f}'})
+        found.append({**line, 'steps': f'{np.mean(same["steps"]):.0f}'})
     return found
