@@ -39,7 +39,7 @@ class World(Protocol):
     world lacks the method. The MuJoCo table, simulator.Simulator, has all of them:
     `observer_picture()`, `move_goal(names, pixels)`, and for `collect`
     `demonstrate(seed, num_frames)`, which lets an expert act and returns a
-    demonstrations.Demonstration. Keyword arguments look=, appearance= and arm= are the table's, too.
+    demonstrations.Demonstration. Keyword arguments look=, appearance= and arm= are the table's.
 
     :ivar task_name: of the present task.
     :ivar arm: the Arm that is seen, None where it is not known.

@@ -105,12 +105,9 @@ def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False) -> mujoco
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    spec.option.iterations = 20
-    spec.option.ls_iterations = 8
-    if gripping:
-        # Soft friction lets what is held creep down: solve for no slip.
-        spec.option.noslip_iterations = 5
-        spec.option.iterations, spec.option.ls_iterations = 50, 20
+    # Soft friction lets what is held creep down: solve for no slip.
+    spec.option.iterations, spec.option.ls_iterations, spec.option.noslip_iterations = (
+        (50, 20, 5) if gripping else (20, 8, 0))
     world = spec.worldbody
     world.add_geom(
         name='table', type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1],
