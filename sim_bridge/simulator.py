@@ -38,12 +38,8 @@ class Simulator(Table):
     def __init__(self, task: str = 'push2', image_size: int = 64, look: str = DEFAULT_LOOK,
                  appearance: str = 'usual', arm: str = DEFAULT_ARM) -> None:
         self.task = get_task(task)
+        self.task_name = self.task.name
         super().__init__(image_size, self.task.gripping, look, appearance, arm)
-
-    @property
-    def task_name(self) -> str:
-        """Return the name of the task."""
-        return self.task.name
 
     def reset(self, seed: int) -> Observation:
         """

@@ -268,9 +268,6 @@ class Table(OneCamera):
 
 def lifted(planar_poses: np.ndarray, height: float | np.ndarray = 0.0) -> np.ndarray:
     """Turn (K, 3) x, y, yaw into (K, 7) poses at a height, or (K,), above the table in metres."""
-    poses = np.zeros((len(planar_poses), 7))
-    poses[:, :2] = planar_poses[:, :2]
-    poses[:, 2] = HALF_HEIGHT + height
-    poses[:, 5] = np.sin(planar_poses[:, 2] / 2)
-    poses[:, 6] = np.cos(planar_poses[:, 2] / 2)
-    return poses
+    level, half = np.zeros(len(planar_poses)), planar_poses[:, 2] / 2
+    return np.column_stack([planar_poses[:, :2], level + (HALF_HEIGHT + height), level, level,
+                            np.sin(half), np.cos(half)])
