@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from experiments.planning.episode import shown_mask
 from experiments.planning.reading import Move, PictureReader, read_moves
 import numpy as np
-from sim_bridge.tasks.stack import on_table, PickAndPlace
+from sim_bridge.tasks.stack import on_table, pick_and_place
 from sim_bridge.tasks.tasks import run_episode as run_expert
 from tap_ros.base.contract import LIFTED, SUCCESS_DISTANCE
 from tap_ros.base.errors import ConfigError
@@ -72,7 +72,7 @@ def stack(simulator, method, seed, predictor=None):
     # The same order for all methods that know none, so that they are compared scene by scene.
     stream = simulator.task.stream
     order = np.random.default_rng([seed, stream, 2]).permutation(simulator.task.num_objects)
-    mover = PickAndPlace(simulator, np.random.default_rng([seed, stream, 3]))
+    rng = np.random.default_rng([seed, stream, 3])
     stages, frames = [], [start.image]
     for picture in pictures:
         poses = simulator.object_poses()[:, :3]
@@ -86,7 +86,7 @@ def stack(simulator, method, seed, predictor=None):
         elif method.base != 'lowest_first':
             moves.sort(key=lambda move: order.tolist().index(move.object))
         for move in moves:
-            frames += _make(simulator, mover, move)
+            frames += _make(simulator, rng, move)
         stages.append(Stage(picture, pixels, moves))
     distances = simulator.distances()
     success = simulator.outcome() == 'success' and bool((distances < SUCCESS_DISTANCE).all())
@@ -98,10 +98,11 @@ def stack(simulator, method, seed, predictor=None):
     return run
 
 
-def _make(simulator, mover, move):
+def _make(simulator, rng, move):
     """Make a move, rise and wait until all is at rest; return the pictures meanwhile."""
     frames = []
-    for plan in mover.move(move.object, lambda: what_is_below(simulator.object_poses(), move)):
+    for plan in pick_and_place(simulator, rng, move.object,
+                               lambda poses: what_is_below(poses, move)):
         frames += [simulator.step(action).image for action in plan]
     rise = [[0, 0, max(LIFTED - simulator.target[2], 0), 1]]
     return frames + [simulator.step(action).image

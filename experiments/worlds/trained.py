@@ -20,7 +20,6 @@ METHODS = {
     'progress': {'selection': 'progress', 'progress_margin': 0.5},
     'still': {'selection': 'still'},
     'marks': {'selection': 'marks'},
-    'fix to marks': {'loss': 'fix', 'selection': 'marks'},
 }
 SETTINGS = {'recipe': 'foreign', 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
 

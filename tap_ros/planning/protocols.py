@@ -22,7 +22,7 @@ class ForwardModel(Protocol):
     """
     Says where objects go when the gripper moves, as maps on a square grid of the table.
 
-    forward_model.LearnedForwardModel and true_model.TrueModel are two.
+    forward_model.LearnedForwardModel and sim_bridge.true_model.TrueModel are two.
     """
 
     @property

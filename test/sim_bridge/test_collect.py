@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 import pytest
-from sim_bridge.collect import collect, CollectConfig, make_episode
+from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode
 from tap_ros.base.engines import Engine
@@ -70,7 +70,7 @@ def test_the_expert_pushes_one_object_home_after_the_other(simulator):
 def test_bottlenecks_come_early_or_late_as_asked(simulator):
     shares, outcomes = {}, []
     for timing in ('early', 'late'):
-        found = [make_episode(simulator, *run_episode(simulator, seed, timing=timing))
+        found = [simulator.demonstrate(seed, timing=timing).episode
                  for seed in range(3)]
         shares[timing] = np.nanmedian([bottleneck_share(episode) for episode in found])
         outcomes += [episode.outcome == 'success' for episode in found]
@@ -125,7 +125,7 @@ def test_a_folder_is_never_mixed_with_other_settings(whole, tmp_path):
 
 
 def test_pushes_at_random_miss(simulator):
-    episode = make_episode(simulator, *run_episode(simulator, 4, misses=1.0))
+    episode = simulator.demonstrate(4, misses=1.0).episode
     low = episode.grippers[:, 2] < 0.03
     moved = np.linalg.norm(np.diff(episode.object_pixels, axis=0), axis=-1).max(1)
     assert (low[:-1] & low[1:] & (moved < 0.05)).any(), 'low, and nothing moves'
