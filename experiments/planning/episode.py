@@ -17,9 +17,8 @@ from tap_ros.images.robot_mask import FreeView, trained_robot_mask
 from tap_ros.planning.action_sequences import DOWN
 from tap_ros.planning.cost import BLOCKED
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import End, Observation, Reach, ReachConfig, SelectTargets
-from tap_ros.planning.visual_mpc import SHORT
+from tap_ros.planning.visual_mpc import Scene, SHORT
 
 
 @dataclass

@@ -24,8 +24,7 @@ from tap_ros.base.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.base.text import listing
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.hierarchy import Itinerary, Target
-from tap_ros.planning.mpc_inputs import Goal, Scene
-from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
+from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 from tap_ros.tracking.protocols import LOST, UNSURE
 
 MOST_REFUSED = 5  # commands refused in a row, after which the goal ends

@@ -33,9 +33,8 @@ from tap_ros.nodes.planner.settings import declare_parameters
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Command, End, Observation, Reach, SelectTargets
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.visual_mpc import Scene, VisualMPC
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.client import Client
 from tap_ros.ros.diagnostics import Diagnostics
