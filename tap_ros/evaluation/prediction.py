@@ -30,7 +30,7 @@ from tap_ros.prediction.protocol import Predictor, Request
 from tap_ros.prediction.warp import WarpedMaps
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.batches import Batch, make_batch, Pictures, Sampling
-from tap_ros.training.inpainted import Filled
+from tap_ros.training.frames import FilledStore
 import torch
 
 METHODS = ('prediction', 'copy-start', 'copy-goal')
@@ -112,7 +112,7 @@ class EpisodeScores:
 
 def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
              episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-             filled: Filled | None = None) -> dict[str, EpisodeScores]:
+             filled: FilledStore | None = None) -> dict[str, EpisodeScores]:
     """
     Measure a predictor, and copying, on episodes it was not trained on.
 

@@ -30,13 +30,14 @@ from tap_ros.training.forward_loss import (
     Windows,
 )
 from tap_ros.training.forward_scores import held_out_scores
-from tap_ros.training.inpainted import Episodes, FilledStore
+from tap_ros.training.frames import Episodes, FilledStore
 from tap_ros.training.run import Run
 from tap_ros.weights import FORWARD_MODEL
 import torch
 
 AVERAGE_DECAY = 0.995  # of the moving average that is shipped
 HORIZON = 8  # control periods of the longest windows
+PICTURES = 4  # compared per window
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
 MOST_MISSED = 3 / 64  # of the picture's side, by which the arm may be beside its fit
 
@@ -137,7 +138,7 @@ def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarr
     length = round(2 + growth * (HORIZON - 2))
     cuts = Cuts.draw(store, training, config.batch_size, length, rng)
     return (make_windows(store, cuts, homography, config.robot_mask),
-            set((rng.permutation(length)[:config.pictures] + 1).tolist()))
+            set((rng.permutation(length)[:PICTURES] + 1).tolist()))
 
 
 def _score(run: Run[ForwardTrainingConfig], episodes: Episodes,

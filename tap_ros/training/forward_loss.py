@@ -21,7 +21,7 @@ import torch
 from torch.nn import functional as F
 
 if TYPE_CHECKING:
-    from tap_ros.training.inpainted import Episodes
+    from tap_ros.training.frames import Episodes
 
 COLOUR_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 MOTION_FACTOR = 8.0  # extra weight of pixels that changed since the window's first picture

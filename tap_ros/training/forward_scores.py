@@ -12,7 +12,7 @@ from tap_ros.training.forward_loss import Cuts, make_windows, MOTION_THRESHOLD
 import torch
 
 if TYPE_CHECKING:
-    from tap_ros.training.inpainted import Episodes
+    from tap_ros.training.frames import Episodes
 
 SCORED_STEPS = (1, 5, 10, 15)
 STRIDE = 8  # frames from one window's start to the next

@@ -112,18 +112,21 @@ class Outcome:
     """
     The loss of a batch and what it came from.
 
-    :param loss: scalar with gradient.
     :param match: int64 (B,), the matched targets as indices into T.
-    :param parts: dict of the terms of the loss, scalars without gradient.
+    :param parts: dict of the terms of the loss, scalars with gradient.
     :param judged: what the discriminators learn from, or None (see discriminators_loss).
-    :param nats: KL divergence of z, mean over the batch, without gradient; None without z.
+    :param nats: KL divergence of z, mean over the batch; None without z.
     """
 
-    loss: torch.Tensor
     match: torch.Tensor
     parts: dict[str, torch.Tensor]
     judged: Judged | None = None
     nats: torch.Tensor | None = None
+
+    @property
+    def loss(self) -> torch.Tensor:
+        """The sum of its terms, scalar with gradient."""
+        return total(self.parts.values())
 
 
 def predictor_loss(networks: Networks, batch: Batch, config: TrainingConfig,
@@ -166,15 +169,13 @@ def predictor_loss(networks: Networks, batch: Batch, config: TrainingConfig,
         assert draws is not None, "t' is drawn"
         judged = _judge(networks, targets, prediction, match, draws)
         with networks.autocast():
-            verdicts = [judge(judged.context, image) for judge, image in judged.pairs]
-        parts['gan'] = GAN_WEIGHT * total(
-            generator_loss(logits, judged.step) for logits in verdicts)
+            parts['gan'] = GAN_WEIGHT * total(
+                generator_loss(judge(judged.context, image), judged.step)
+                for judge, image in judged.pairs)
     if config.recursion > 1:
         parts['error'] = _recursive_loss(
             networks, targets, prediction, match, parts['error'], z)
-    return Outcome(total(parts.values()), match,
-                   {name: value.detach() for name, value in parts.items()}, judged,
-                   None if nats is None else nats.detach())
+    return Outcome(match, parts, judged, nats)
 
 
 def _judge(networks: Networks, targets: Targets, prediction: Prediction, match: torch.Tensor,
@@ -282,6 +283,4 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, draws: Draws,
         whole, lambda: targets.errors(targets.measured), batch, targets.config), batch.valid)
     nats, error = (values.gather(1, match[:, None]).mean()
                    for values in (divergences, errors))
-    parts = {'kl': kl_weight * nats, 'error': error}
-    return Outcome(total(parts.values()), match,
-                   {name: value.detach() for name, value in parts.items()}, nats=nats.detach())
+    return Outcome(match, {'kl': kl_weight * nats, 'error': error}, nats=nats)

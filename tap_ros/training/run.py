@@ -23,9 +23,8 @@ from tap_ros.recording.bags import check_first_picture, find_bags
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import reading_of
 from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
-from tap_ros.training.inpainted import with_masks
 from tap_ros.training.run_config import RunConfig
-from tap_ros.training.split import split_episodes, warn_if_few
+from tap_ros.training.split import split_episodes, warn_if_few, with_masks
 from tap_ros.weights.devices import pick_device
 from tap_ros.weights.weights import save_weights
 import torch
