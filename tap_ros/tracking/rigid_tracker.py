@@ -111,7 +111,7 @@ class RigidTracker:
     def find(self, view: View) -> Tracked:
         """Find the objects in another picture; see Tracker."""
         return register(self._first, Picture(view, self._plane), self._plane,
-                        [[one.face] for one in self._objects])
+                        [one.face for one in self._objects])
 
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
@@ -188,13 +188,12 @@ class RigidTracker:
         covered = picture.hidden.astype(np.uint8)
         for other in self._objects:
             if other is not one and other.state == SEEN:
-                cv2.fillPoly(covered, [np.rint(self._plane.top_pixels(other.shown.outlined(
-                    other.place, other.angle))).astype(np.int32)], 1)
+                cv2.fillPoly(covered, [np.rint(self._outline(other)).astype(np.int32)], 1)
         return covered > 0
 
     def _window(self, one: _Object) -> tuple[slice, slice]:
         """Return the part of the working picture that shows an object and what is next to it."""
-        pixels = self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
+        pixels = self._outline(one)
         (u, v), (right, low) = pixels.min(0).astype(int), pixels.max(0).astype(int)
         return np.s_[max(v - BESIDE, 0):max(low + BESIDE, 0), max(u - BESIDE, 0):max(
             right + BESIDE, 0)]
@@ -204,8 +203,8 @@ class RigidTracker:
         at, *others = self._plane.middle_pixels([one.place, *(
             other.place for other in self._objects if other is not one)])
         one.waits = WAITS
-        pixels = self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
-        radius = min(float(np.linalg.norm(pixels - at, axis=1).max()) * 1.4 + 4, RADIUS)
+        far = np.linalg.norm(self._outline(one) - at, axis=1).max()
+        radius = min(float(far) * 1.4 + 4, RADIUS)
         mask, _ = silhouette(picture, at, others, radius)
         beside = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
         if 0.6 < mask.sum() / one.keys[0].area < 1.6 and not (beside & picture.hidden).any():
@@ -219,8 +218,11 @@ class RigidTracker:
             self._plane.enlarge(self._plane.middle_pixels(places)) if self._objects else places,
             tuple(one.state for one in self._objects),
             np.array([one.confidence for one in self._objects]),
-            tuple(self._plane.enlarge(self._plane.top_pixels(one.shown.outlined(
-                one.place, one.angle))) for one in self._objects))
+            tuple(self._plane.enlarge(self._outline(one)) for one in self._objects))
+
+    def _outline(self, one: _Object) -> np.ndarray:
+        """Return the outline (N, 2) of an object in the working picture."""
+        return self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
 
 
 def _still(window: tuple[slice, slice], before: Picture, now: Picture) -> bool:

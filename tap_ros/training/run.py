@@ -85,8 +85,7 @@ class Run(Generic[Config]):
         self.device = pick_device(config.device)
         if config.threads:
             torch.set_num_threads(config.threads)
-        reading = reading_of(config)
-        paths = paths_of(config)
+        reading, paths = reading_of(config), paths_of(config)
         check_first_picture(paths, reading, f'the {self.kind.replace("_", " ")}')
         self.store = open_recordings(paths, progress=self.progress, reading=reading)
         with ExitStack() as stack:
@@ -143,11 +142,10 @@ class Run(Generic[Config]):
         :raises KeyboardInterrupt: after the step in which Ctrl-C was pressed, and all is saved.
         """
         config, state = self.config, self.state
-        interrupted = self._stack.enter_context(_first_interrupt())
-        curves = self._stack.enter_context(SummaryWriter(config.out, purge_step=state.step))
-        bar = self._stack.enter_context(tqdm(
-            total=config.steps, initial=state.step, unit='step', disable=not self.progress,
-            desc=self.kind.replace('_', ' ')))
+        interrupted, curves, bar = map(self._stack.enter_context, (
+            _first_interrupt(), SummaryWriter(config.out, purge_step=state.step),
+            tqdm(total=config.steps, initial=state.step, unit='step', disable=not self.progress,
+                 desc=self.kind.replace('_', ' '))))
         began = time.monotonic() - state.seconds
 
         def hopeless() -> bool:
