@@ -172,7 +172,9 @@ class VisualMPC:
         """
         Load a learned forward model's weights.
 
-        :param path: safetensors file of kind 'forward_model'.
+        :param path: safetensors file of kind 'forward_model', such as weights.FORWARD_MODEL.
+        :param config: of the search; None: the default.
+        :param device: where to predict, 'cpu' or 'cuda'.
         :raises WeightsError: for a file that is missing, damaged or of another kind.
         """
         return cls(LearnedForwardModel.load(path, device), config)

@@ -264,20 +264,17 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, draws: Draws,
     genmin the selection error is that of the whole loss instead of the l1 error.
     """
     batch = targets.batch
-    B, T = batch.times.shape
     assert networks.recognition is not None
-    divergences, errors = [], []
-    for t in range(T):
+    terms = []
+    for t in range(batch.times.shape[1]):
         step = torch.full_like(targets.rows, t)
-        frame = targets.frame(step)
         with networks.autocast():
             mean, log_variance = networks.recognition(
-                torch.cat([targets.context, frame[:, None]], 1))
+                torch.cat([targets.context, targets.frame(step)[:, None]], 1))
             z = sample_latent(mean, log_variance, draws.posterior[:, t])
-        prediction = networks.predict(targets.context, z)
-        divergences.append(kl_divergence(mean, log_variance))
-        errors.append(targets.l1(prediction.image, step))
-    divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
+        terms.append((kl_divergence(mean, log_variance),
+                      targets.l1(networks.predict(targets.context, z).image, step)))
+    divergences, errors = (torch.stack(values, 1) for values in zip(*terms))  # B, T
     whole = (kl_weight * divergences + errors).detach()
     match = match_step(selection_errors(
         whole, lambda: targets.errors(targets.measured), batch, targets.config), batch.valid)
