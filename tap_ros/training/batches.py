@@ -239,7 +239,7 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
     if sampling.start_crop:
         late = min(int(rng.uniform(0, sampling.start_crop) * length), length - 3)
         start, length = start + late, length - late
-    end = length - 1
+    end, goal = length - 1, start + length - 1
     first, last = target_times(end, sampling.margin, sampling.forward)
     times = np.arange(first, last + 1)
     if sampling.fraction is not None:
@@ -248,7 +248,6 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
         times = np.append(fixed, others if len(others) or not sampling.num_others else fixed)
     elif sampling.num_targets and len(times) > sampling.num_targets:
         times = np.sort(rng.choice(times, sampling.num_targets, replace=False))
-    goal = start + end
     if (sampling.goal_picture != 'last'
             and uses_recorded_goal(store[i], sampling.goal_picture, rng)
             and start + length == available):

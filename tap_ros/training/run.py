@@ -88,20 +88,19 @@ class Run(Generic[Config]):
         reading, paths = reading_of(config), paths_of(config)
         check_first_picture(paths, reading, f'the {self.kind.replace("_", " ")}')
         self.store = open_recordings(paths, progress=self.progress, reading=reading)
-        with ExitStack() as stack:
-            stack.enter_context(_run_folder(config.out))
-            self.training, self.held_out = with_masks(self.store, split_episodes(
-                self.store, config.test_fraction, self._min_frames, config.held_out),
-                config.robot_mask)
-            if not len(self.training):
-                raise RecordingError('recordings: all that --held-out leaves is too short to '
-                                     'train on; name others')
-            if config.held_out and not len(self.held_out):
-                raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
-                                     'by itself; name whole bags, not files of a split one')
-            warn_if_few(self.held_out)
-            torch.manual_seed(config.seed)
-            self._stack = stack.pop_all()
+        self.training, self.held_out = with_masks(self.store, split_episodes(
+            self.store, config.test_fraction, self._min_frames, config.held_out),
+            config.robot_mask)
+        if not len(self.training):
+            raise RecordingError('recordings: all that --held-out leaves is too short to '
+                                 'train on; name others')
+        if config.held_out and not len(self.held_out):
+            raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
+                                 'by itself; name whole bags, not files of a split one')
+        warn_if_few(self.held_out)
+        torch.manual_seed(config.seed)
+        self._stack = ExitStack()
+        self._stack.enter_context(_run_folder(config.out))
         return self
 
     def __exit__(self, *error: Any) -> bool | None:
@@ -160,11 +159,11 @@ class Run(Generic[Config]):
             # Tell and save.
             bar.update()
             if state.step % config.log_every == 0:
-                shown = {name: float(value) for name, value in self._shown.items()}
-                shown['learning_rate'] = state.optimizers[0].param_groups[0]['lr']
-                for name, value in shown.items():
+                rate = state.optimizers[0].param_groups[0]['lr']
+                for name, value in {**self._shown, 'learning_rate': rate}.items():
                     curves.add_scalar(f'train/{name}', value, state.step)
-                bar.set_postfix({name: f'{shown[name]:.4f}' for name in list(shown)[:2]})
+                bar.set_postfix({name: f'{float(self._shown[name]):.4f}'
+                                 for name in list(self._shown)[:2]})
             if self._after_step is not None:
                 self._after_step(state.step)
             at_end = state.step == config.steps
@@ -189,7 +188,7 @@ class Run(Generic[Config]):
     def _report(self, score: Score, curves: SummaryWriter) -> None:
         """Write scores, sample pictures, what the run was, and the averaged weights."""
         config, state, store = self.config, self.state, self.store
-        scores, pictures = score()
+        settings, (scores, pictures) = asdict(config), score()
         for name, value in scores.items():
             curves.add_scalar(f'held_out/{name}', value, state.step)
         for name, picture in pictures.items():
@@ -204,7 +203,6 @@ class Run(Generic[Config]):
                        + (torch.cuda.get_device_name(self.device)
                           if self.device.type == 'cuda' else self.device.type),
             'torch': torch.__version__, 'python': platform.python_version(), **self.about}
-        settings = asdict(config)
         for name, values in (('config', settings), ('run', about), ('scores', scores)):
             write_atomically(Path(config.out, f'{name}.json'), json.dumps(values, indent=2) + '\n')
         save_weights(self.weights, state.average, self.kind, state.network.config,

@@ -107,13 +107,8 @@ def with_masks(store: 'EpisodeStore', parts: tuple[np.ndarray, np.ndarray],
 
 
 def warn_if_few(held_out: np.ndarray) -> None:
-    """Say before a training that nothing will be measured, or that few episodes measure it."""
-    if not len(held_out):
-        warnings.warn('recordings: no episode is held out, so nothing is measured; record at '
-                      'least two, and give a --test-fraction above 0', RecordingWarning,
-                      stacklevel=3)
-    elif len(held_out) < FEW:
-        count = f'{len(held_out)} episode{"s are" if len(held_out) > 1 else " is"}'
-        warnings.warn(f'recordings: only {count} held out, and scores of fewer than {FEW} say '
-                      'little; record more, give a larger --test-fraction, or --held-out BAG',
-                      RecordingWarning, stacklevel=3)
+    """Say before a training that few episodes, or none, measure how good it is."""
+    if len(held_out) < FEW:
+        warnings.warn(f'recordings: episodes held out: {len(held_out)}; scores of fewer than '
+                      f'{FEW} say little; record more, give a larger --test-fraction, or '
+                      '--held-out BAG', RecordingWarning, stacklevel=3)
