@@ -8,6 +8,7 @@ same.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 from experiments.planning.following import Follower
 import numpy as np
@@ -18,7 +19,7 @@ from tap_ros.planning.action_sequences import DOWN
 from tap_ros.planning.cost import BLOCKED
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.reach import End, Observation, Reach, ReachConfig, SelectTargets
-from tap_ros.planning.visual_mpc import Scene, SHORT
+from tap_ros.planning.visual_mpc import Memory, Scene, SHORT
 
 
 @dataclass
@@ -146,7 +147,8 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=(
             first, last_picture, start, end, num_samples=method.samples,
             recursion_depth=method.recursion, seed=seed)
         subgoals = choose_sample(
-            mpc, Scene(now, seen.gripper, start), end, found, seed)
+            mpc, Scene(now, seen.gripper, start), end, found,
+            partial(mpc.plan, memory=Memory(seed)))
         return targets_by(subgoals, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []

@@ -34,7 +34,7 @@ from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.reach import Command, End, Observation, Reach, SelectTargets
-from tap_ros.planning.visual_mpc import Scene, VisualMPC
+from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.client import Client
 from tap_ros.ros.diagnostics import Diagnostics
@@ -303,9 +303,14 @@ class VisualMpcNode(LifecycleBase):
             self._go_on(handle)
             raise
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
+
+        def plan(scene: Scene, goal: Goal) -> Plan:
+            self._go_on(handle)
+            return self._mpc.plan(scene, goal, Memory(request.seed), limits)
+
         return targets_by(choose_sample(
-            self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found,
-            request.seed, limits, lambda: self._go_on(handle)), goal_pixels)
+            self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found, plan),
+            goal_pixels)
 
     def _send(self, handle: ServerGoalHandle, accepted: float, reach: Reach,
               command: Command) -> bool:
