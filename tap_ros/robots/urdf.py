@@ -18,7 +18,7 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import escaped, listing
 
 MOST_CHARACTERS = 2**21
-MOST_LINKS = 1000
+MOST_LINKS, MOST_SHAPES = 300, 3000  # more take seconds to read
 KINDS = ('revolute', 'continuous', 'prismatic', 'fixed')
 SHAPES = ('box', 'cylinder', 'sphere', 'capsule')
 # What MuJoCo is given of each element: neither files, nor what masses and limits would need.
@@ -137,8 +137,8 @@ def _checked(robot: ElementTree.Element) -> dict[str, Mimic]:
                                   'numbers')
     shapes = [(link.get('name'), next(collision.iterfind('geometry/*'), None)) for link in
               robot.iterfind('link') for collision in link.iterfind('collision')]
-    if not shapes:
-        raise ConfigError('has no collision geometry')
+    if not 0 < len(shapes) <= MOST_SHAPES:
+        raise ConfigError(f'has collision geometries: {len(shapes)}; expected 1 to {MOST_SHAPES}')
     for link, shape in shapes:
         if shape is None or shape.tag not in SHAPES:
             kind = 'shape that is missing' if shape is None else escaped(shape.tag)

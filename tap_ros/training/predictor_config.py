@@ -10,9 +10,12 @@ from typing import Literal
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import Folder
 from tap_ros.images.robot_mask import RobotMask
-from tap_ros.training.methods import Latent, Loss, method_name, Mode, Selection
 from tap_ros.training.run_config import RunConfig
 
+Mode = Literal['bidirectional', 'forward']  # contract.MODES
+Loss = Literal['fix', 'min', 'genmin']
+Selection = Literal['absolute', 'relative', 'progress', 'still', 'marks']
+Latent = Literal['none', 'vae']
 GoalPicture = Literal['last', 'recorded', 'mixed']
 Posterior = Literal['video', 'frame']
 Precision = Literal['auto', 'float32', 'bfloat16']
@@ -125,9 +128,17 @@ class TrainingConfig(RunConfig):
 
     @property
     def method(self) -> str:
-        """The name of the method in the paper's tables."""
-        return method_name(self.loss, self.selection, self.gan, self.latent, self.fraction,
-                           self.beta if self.forward else None)
+        """
+        The name of the method in the paper's tables, such as 'fix0.25' or 'genmin-vae-gan'.
+
+        As there, fix, min and genmin alone are trained with l1 and GAN, -wo-gan by l1 only.
+        """
+        number = {'fix': '' if self.fraction == 0.5 else f'{self.fraction:g}',
+                  'genmin': f'{self.beta:g}' if self.forward else ''}.get(self.loss, '')
+        model = '-vae' + '-gan' * self.gan if self.latent == 'vae' else '-wo-gan' * (not self.gan)
+        chosen = f'+{self.selection}' if self.selection == 'marks' or (
+            self.loss == 'genmin' and self.selection != 'absolute') else ''
+        return f'{self.loss}{number}{model}{chosen}'
 
     @property
     def only_fraction(self) -> float | None:

@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 
+from experiments.paper.methods import method_fields
 from made_episodes import cover, write_bag
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.batches import Augmentation, make_batch, Pictures, Sampling
 from tap_ros.training.frames import FilledStore
-from tap_ros.training.methods import method_fields
 from tap_ros.training.objective import (
     discriminators_loss,
     Draws,

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.base.contract import CAMERA_FRAME
+from tap_ros.base.contract import CAMERA_FRAME, MODES
 from tap_ros.base.errors import ConfigError, ImageError, TapError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import TrainedCrop
@@ -30,7 +30,6 @@ from tap_ros.ros.robot_view import RobotView
 from tap_ros.ros.ros_messages import encode_subgoal
 from tap_ros.ros.subscriptions import rivals
 from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, STREAM
-from tap_ros.training.methods import MODES
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
