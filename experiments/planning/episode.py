@@ -8,7 +8,6 @@ same.
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 from experiments.planning.following import Follower
 import numpy as np
@@ -148,7 +147,7 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=(
             recursion_depth=method.recursion, seed=seed)
         subgoals = choose_sample(
             mpc, Scene(now, seen.gripper, start), end, found,
-            partial(mpc.plan, memory=Memory(seed)))
+            lambda *leg: mpc.plan(*leg, Memory(seed)))
         return targets_by(subgoals, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []

@@ -135,17 +135,19 @@ def choose_sample(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
     :param scene: visual_mpc.Scene, what is seen now.
     :param goal_pixels: (K, 2).
     :param subgoals: of any samples, earliest first in each.
-    :param plan: plans as mpc.plan, with the seed and the limits that count.
+    :param plan: makes the plan of a leg, by `mpc`; what it raises ends the choice.
     :return: those of the sample taken, earliest first; the first of equals.
     """
     def cost(chain: list['Subgoal']) -> float:
         total, now = 0.0, scene
-        for subgoal in chain:
-            leg = plan(now, mpc.goal(maps=subgoal.object_maps))
+        for subgoal in [*chain, None]:
+            leg = plan(now, mpc.goal(goal_pixels) if subgoal is None
+                       else mpc.goal(maps=subgoal.object_maps))
             total += leg.cost
-            now = Scene(subgoal.image, gripper_after(now.gripper, leg.actions),
-                        subgoal.expected_pixels)
-        return total + plan(now, mpc.goal(goal_pixels)).cost
+            if subgoal is not None:
+                hand = gripper_after(now.gripper, leg.actions)
+                now = Scene(subgoal.image, hand, subgoal.expected_pixels)
+        return total
 
     samples: dict[int, list[Subgoal]] = {}
     for subgoal in subgoals:

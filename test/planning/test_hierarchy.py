@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.planning.action_sequences import gripper_after
+from tap_ros.planning.action_sequences import gripper_after, Limits
 from tap_ros.planning.hierarchy import (
     choose_sample,
     Itinerary,
@@ -87,12 +87,11 @@ def test_samples_are_judged_leg_by_leg():
     mpc, plans = small_planner(), []
 
     def plan(seen, goal):
-        plans.append((seen, goal, mpc.plan(seen, goal, Memory(7))))
+        plans.append((seen, goal, mpc.plan(seen, goal, Memory(7), Limits(0.01, 0.02))))
         return plans[-1][-1]
 
     samples = [subgoal(PLACES + 2.0 * i, i) for i in range(2)]
     chosen = choose_sample(mpc, scene(PLACES), PLACES + 4.0, samples, plan)
-    assert len(plans) == 4
     costs = [sum(found.cost for *_, found in plans[i:i + 2]) for i in (0, 2)]
     assert chosen == [samples[np.argmin(costs)]]
     for sample, (_, to, first), (then, _, _) in zip(samples, plans[::2], plans[1::2]):
@@ -108,12 +107,12 @@ def test_subgoals_are_divided_by_their_sample_and_one_sample_needs_no_plan():
     between = [start + [2.0, 0.0], start + [4.0, 0.0]]
     found = [subgoal(astray, 0, 2), subgoal(astray, 0, 1),
              subgoal(between[0], 1, 2), subgoal(between[1], 1, 1)]
-    plans, mpc = [], small_planner()
+    mpc, plans = small_planner(), []
 
-    def plan(seen, to):
-        plans.append(mpc.plan(seen, to))
-        return plans[-1]
+    def plan(*leg):
+        plans.append(leg)
+        return mpc.plan(*leg)
 
-    assert choose_sample(mpc, scene(start), goal, found, plan) == found[2:]
-    assert len(plans) == 6  # two legs and the last, for two samples
+    taken = choose_sample(mpc, scene(start), goal, found, plan)
+    assert taken == found[2:] and len(plans) == 6  # two legs and the last, for two samples
     assert choose_sample(None, scene(start), goal, found[:2], None) == found[:2]
