@@ -43,12 +43,9 @@ class Picture:
         self.lab = np.asarray(cv2.LUT(lab, _WEIGHED))
         parts: list[np.ndarray] = [np.asarray(part) for part in cv2.split(cv2.LUT(lab, _INDEX))]
         self.index: np.ndarray = np.bitwise_or(np.bitwise_or(parts[0], parts[1]), parts[2])
-        if view.robot_mask is None:
-            self.hidden = np.zeros(self.size, bool)
-        else:
-            mask = np.asarray(view.robot_mask)
-            self.hidden = (mask if mask.shape == self.size else cv2.resize(
-                mask, (w, h), interpolation=cv2.INTER_NEAREST)) > 0
+        mask = np.zeros(self.size, np.uint8) if view.robot_mask is None else view.robot_mask
+        self.hidden = np.asarray(mask if mask.shape == self.size else cv2.resize(
+            mask, (w, h), interpolation=cv2.INTER_NEAREST)) > 0
 
     def apart(self, other: 'Picture') -> np.ndarray:
         """Return the distance (h, w) float32 of the colours of each pixel."""

@@ -56,10 +56,6 @@ class _Object:
     def __post_init__(self) -> None:
         self.shown = self.keys[0]
 
-    def nearest(self) -> list[Template]:
-        """Return its templates, those of the nearest angle first."""
-        return sorted(self.keys, key=lambda key: abs(_turned(key.angle - self.angle)))
-
 
 class RigidTracker:
     """
@@ -100,9 +96,8 @@ class RigidTracker:
         if not self._objects:
             return self._tracked()
         picture = Picture(view, self._plane)
-        hand = None
-        if view.gripper is not None and self._gripper is not None:
-            hand = np.stack([self._gripper, view.gripper])[:, :3]
+        hand = None if view.gripper is None or self._gripper is None else (
+            np.stack([self._gripper, view.gripper])[:, :3])
         self._gripper = view.gripper
         for one in self._objects:
             self._follow(one, picture, hand)
@@ -121,7 +116,7 @@ class RigidTracker:
         if one.age and hand is not None:
             one.place = one.place + _pushed(one, hand)
         matcher = Matcher(picture, self._plane, self._covered(one, picture))
-        keys = one.nearest()
+        keys = sorted(one.keys, key=lambda key: abs(_turned(key.angle - one.angle)))
         found = self._search(one, keys, matcher, hand)
         pose, key = found if found is not None else (None, keys[0])
         if pose is not None and pose.fit > GOOD:

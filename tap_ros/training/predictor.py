@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training the predictor on recordings (section 3, appendix C)."""
 
-from collections.abc import Callable, Mapping
-import contextlib
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
@@ -39,7 +38,7 @@ from tap_ros.training.predictor_config import TrainingConfig
 from tap_ros.training.run import Run
 from tap_ros.training.selection import Targets
 from tap_ros.training.training_networks import Discriminator, Recognition
-from tap_ros.weights.devices import Autocast, make_autocast, pick_precision
+from tap_ros.weights.devices import make_autocast, pick_precision
 import torch
 
 AVERAGE_DECAY = 0.999  # of the moving average that is shipped
@@ -78,7 +77,8 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
         draw = partial(draw_batch, run.store, run.training, config, pictures)
         state.network.train()
         state.helpers.train()
-        for step, batch in run.steps(draw, partial(_score, run, pictures), config.patience):
+        score, show = partial(_score, run, pictures), partial(_show, run, pictures)
+        for step, batch in run.steps(draw, score, show, config.patience):
             batch = batch.to(run.device)
 
             # Eqs. 1 to 10: the predictor, and the recognition network.
@@ -159,56 +159,44 @@ def _values(outcome: Outcome, batch: Batch) -> dict[str, torch.Tensor]:
     return {name: value.detach() for name, value in values.items()}
 
 
-def _score(run: Run[TrainingConfig], pictures: Pictures,
-           ) -> tuple[Mapping[str, float], Mapping[str, np.ndarray]]:
-    """Score the averaged network, z at 0, where its method matches; show some of all."""
-    config, held_out, network = run.config, run.held_out, run.state.average
-    autocast = make_autocast(run.state.precision, run.device)
-    sampling = Sampling(
-        config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
-        forward=config.forward, fraction=config.only_fraction, fill_context=config.fill_context)
-
-    def gather(episodes: np.ndarray) -> Batch:
-        return make_batch(run.store, episodes, sampling, pictures=pictures).to(run.device)
-
-    scores, shown, rows = {}, {}, []
-    for i in range(0, len(held_out), 64):
-        part = gather(held_out[i:i + 64])
-        prediction, match = matched(network, part, config, autocast)
-        frame = to_float(part.targets[torch.arange(len(match), device=match.device), match])
-        image = part.visible(prediction.image[:, None])[:, 0]
+def _score(run: Run[TrainingConfig], pictures: Pictures) -> dict[str, float]:
+    """Score the averaged network on the held-out episodes, where its method matches."""
+    rows = []
+    for i in range(0, len(run.held_out), 64):
+        batch, prediction, match = _matched(run, pictures, run.held_out[i:i + 64])
+        frame = to_float(batch.targets[torch.arange(len(match), device=match.device), match])
+        image = batch.visible(prediction.image[:, None])[:, 0]
         rows.append(torch.stack([
-            l1_error(image, frame), l1_error(to_float(part.measured), frame[:, None]).amin(1),
-            (part.times.gather(1, match[:, None]) / part.end)[:, 0]]).cpu())
-    if rows:
-        error, copying, share = torch.cat(rows, 1)
-        scores = {'loss': error.mean(), 'relative': error.mean() / copying.mean(),
-                  'match_fraction': share.mean(), 'match_fraction_std': share.std(correction=0)}
-    for name, episodes in (('training', run.training), ('held_out', held_out)):
-        if len(episodes):
-            some = gather(episodes[:_SHOWN])
-            shown[name] = sample_grid(some, *matched(network, some, config, autocast))
-    return {name: score.item() for name, score in scores.items()}, shown
+            l1_error(image, frame), l1_error(to_float(batch.measured), frame[:, None]).amin(1),
+            (batch.times.gather(1, match[:, None]) / batch.end)[:, 0]]).cpu())
+    if not rows:
+        return {}
+    error, copying, share = torch.cat(rows, 1)
+    return {name: score.item() for name, score in {
+        'loss': error.mean(), 'relative': error.mean() / copying.mean(),
+        'match_fraction': share.mean(), 'match_fraction_std': share.std(correction=0)}.items()}
 
 
 @torch.no_grad()
-def matched(network: PredictorNetwork, batch: Batch, config: TrainingConfig,
-            autocast: Autocast = contextlib.nullcontext) -> tuple[Prediction, torch.Tensor]:
-    """
-    Predict, with z at 0, and find the frames that the method chooses.
-
-    :param network: PredictorNetwork in eval mode.
-    :param batch: batches.Batch, on the network's device.
-    :param autocast: makes the context manager to run the network in.
-    :return: (Prediction, int64 (B,) indices into T).
-    """
+def _matched(run: Run[TrainingConfig], pictures: Pictures,
+             episodes: np.ndarray) -> tuple[Batch, Prediction, torch.Tensor]:
+    """Predict with the averaged network, z at 0; find the frames (B,) that its method chooses."""
+    config = run.config
+    batch = make_batch(run.store, episodes, Sampling(
+        config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
+        forward=config.forward, fraction=config.only_fraction,
+        fill_context=config.fill_context), pictures=pictures).to(run.device)
     targets = Targets(batch, config)
-    with autocast():
-        prediction = network(targets.context)
-    return prediction, targets.match(prediction.image, targets.measured)
+    with make_autocast(run.state.precision, run.device)():
+        prediction = run.state.average(targets.context)
+    return batch, prediction, targets.match(prediction.image, targets.measured)
 
 
-@torch.no_grad()
+def _show(run: Run[TrainingConfig], pictures: Pictures, episodes: np.ndarray) -> np.ndarray:
+    """Draw predictions of some episodes, see sample_grid."""
+    return sample_grid(*_matched(run, pictures, episodes[:_SHOWN]))
+
+
 def sample_grid(batch: Batch, prediction: Prediction, match: torch.Tensor) -> np.ndarray:
     """
     Show a batch: context, prediction, matched frame, one mask for each source, new pixels.

@@ -34,8 +34,7 @@ from tqdm import tqdm
 Trained = TypeVar('Trained', bound=torch.nn.Module)
 Item = TypeVar('Item')  # what a step takes
 Config = TypeVar('Config', bound=RunConfig)
-# Scores by name, and pictures (H, W, 3).
-Score = Callable[[], tuple[Mapping[str, float], Mapping[str, np.ndarray]]]
+Show = Callable[[np.ndarray], np.ndarray]  # from indices of episodes to a picture (H, W, 3)
 
 
 class Run(Generic[Config]):
@@ -44,7 +43,7 @@ class Run(Generic[Config]):
 
         with Run(config, 'predictor') as run:
             state = run.begin(network, average_decay)
-            for step, item in run.steps(draw, score):
+            for step, item in run.steps(draw, score, show):
                 ...  # moves state.network by state.optimizers
                 run.show({'loss': loss})
 
@@ -128,13 +127,14 @@ class Run(Generic[Config]):
         """Show numbers of a step in the curves, the first two on the progress bar."""
         self._shown = values
 
-    def steps(self, draw: Callable[[int], Item], score: Score,
-              patience: int = 0) -> Iterator[tuple[int, Item]]:
+    def steps(self, draw: Callable[[int], Item], score: Callable[[], Mapping[str, float]],
+              show: Show, patience: int = 0) -> Iterator[tuple[int, Item]]:
         """
         Yield the number of each step and what it takes; after it show, score and save.
 
         :param draw: makes what a step takes from its number, two steps ahead in another thread.
-        :param score: scores the averaged network, and shows what it does.
+        :param score: scores the averaged network on the held-out episodes.
+        :param show: draws what it does in some of those that it is given.
         :param patience: steps after which the run ends if the score 'relative', of the held-out
             episodes, has not become smaller; the weights are then those with the smallest.
             0: never.
@@ -168,7 +168,7 @@ class Run(Generic[Config]):
                 self._after_step(state.step)
             at_end = state.step == config.steps
             if patience and (state.step % max(1, patience // 5) == 0 or at_end):
-                state.note(score()[0]['relative'])
+                state.note(score()['relative'])
                 if state.best and (hopeless() or at_end):
                     state.average.load_state_dict(state.best)
             stopped = interrupted.is_set() or hopeless()
@@ -176,7 +176,7 @@ class Run(Generic[Config]):
                 state.seconds = time.monotonic() - began
                 if patience:
                     self.about['best_step'] = state.best_step
-                self._report(score, curves)  # first: one killed in between reports again
+                self._report(score(), show, curves)  # first: one killed in between reports again
                 save_checkpoint(self.checkpoint, state, asdict(config), self._data_hash)
             if stopped:
                 break
@@ -185,14 +185,15 @@ class Run(Generic[Config]):
                        'command goes on from there', sys.stderr)
             raise KeyboardInterrupt
 
-    def _report(self, score: Score, curves: SummaryWriter) -> None:
+    def _report(self, scores: Mapping[str, float], show: Show, curves: SummaryWriter) -> None:
         """Write scores, sample pictures, what the run was, and the averaged weights."""
         config, state, store = self.config, self.state, self.store
-        settings, (scores, pictures) = asdict(config), score()
+        settings = asdict(config)
         for name, value in scores.items():
             curves.add_scalar(f'held_out/{name}', value, state.step)
-        for name, picture in pictures.items():
-            curves.add_image(name, picture, state.step, dataformats='HWC')
+        for name, part in (('training', self.training), ('held_out', self.held_out)):
+            if len(part):
+                curves.add_image(name, show(part), state.step, dataformats='HWC')
         about = {
             **({'precision': state.precision} if state.precision else {}),
             'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
