@@ -82,7 +82,7 @@ class Batch:
 @dataclass(frozen=True)
 class Sampling:
     """
-    What is taken from an episode; what is not told here, see training_config.TrainingConfig.
+    What is taken from an episode; what is not told here, see predictor_config.TrainingConfig.
 
     :param forward: whether the start picture is all of the context.
     :param fraction: take only the frame at this share of the episode, 0 to 1, as fixed-time

@@ -145,7 +145,7 @@ def predictor_loss(networks: Networks, batch: Batch, config: TrainingConfig,
     out of the choice.
 
     :param draws: needed with GAN or VAE.
-    :param kl_share: of the weight of the KL divergence at this step, see training.kl_share.
+    :param kl_share: of the weight of the KL divergence at this step, see predictor.kl_share.
     :return: Outcome.
     """
     targets = Targets(batch, config)

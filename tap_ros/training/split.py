@@ -109,6 +109,7 @@ def with_masks(store: 'EpisodeStore', parts: tuple[np.ndarray, np.ndarray],
 def warn_if_few(held_out: np.ndarray) -> None:
     """Say before a training that few episodes, or none, measure how good it is."""
     if len(held_out) < FEW:
-        warnings.warn(f'recordings: episodes held out: {len(held_out)}; scores of fewer than '
-                      f'{FEW} say little; record more, give a larger --test-fraction, or '
-                      '--held-out BAG', RecordingWarning, stacklevel=3)
+        count = f'{len(held_out)} episode{" is" if len(held_out) == 1 else "s are"}'
+        warnings.warn(f'recordings: only {count} held out, and scores of fewer than {FEW} say '
+                      'little; record more, give a larger --test-fraction, or --held-out BAG',
+                      RecordingWarning, stacklevel=3)
