@@ -174,7 +174,6 @@ class Arm:
                     'degrees/s')
 
     def _check(self, share: np.ndarray, of: str, values: np.ndarray, unit: str) -> None:
-        """Refuse shares of a limit above 1, naming the worst joint."""
         worst = int(share.argmax())
         if share[worst] > 1:
             raise KinematicsError(f'{self.joints[worst]} would be at {share[worst]:.2f} of {of} '

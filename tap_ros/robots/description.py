@@ -73,5 +73,4 @@ def _origin(place: Iterable[float], turn: Iterable[float]) -> str:
 
 
 def _text(numbers: Iterable[float]) -> str:
-    """Return numbers as URDF writes them."""
     return ' '.join(repr(float(number)) for number in numbers)

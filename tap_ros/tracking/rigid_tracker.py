@@ -216,12 +216,10 @@ class RigidTracker:
             tuple(self._plane.enlarge(self._outline(one)) for one in self._objects))
 
     def _outline(self, one: _Object) -> np.ndarray:
-        """Return the outline (N, 2) of an object in the working picture."""
         return self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
 
 
 def _still(window: tuple[slice, slice], before: Picture, now: Picture) -> bool:
-    """Return whether a window shows the same in two pictures."""
     if (before.hidden[window] != now.hidden[window]).any():
         return False
     apart = cv2.absdiff(before.lab[window], now.lab[window])
@@ -243,5 +241,4 @@ def _pushed(one: _Object, hand: np.ndarray) -> np.ndarray:
 
 
 def _turned(angle: float) -> float:
-    """Return an angle between -pi and pi."""
     return float(np.angle(np.exp(1j * angle)))

@@ -223,7 +223,6 @@ def _mean(values: np.ndarray) -> np.ndarray:
 
 
 def _round(side: int) -> np.ndarray:
-    """Return a round structuring element."""
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
 
 
@@ -235,7 +234,6 @@ def _draw(mask: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _square(count: int) -> np.ndarray:
-    """Return places (count * count, 2) from -1 to 1."""
     line = np.linspace(-1, 1, count)
     return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
 

@@ -193,7 +193,6 @@ def _matched(run: Run[TrainingConfig], pictures: Pictures,
 
 
 def _show(run: Run[TrainingConfig], pictures: Pictures, episodes: np.ndarray) -> np.ndarray:
-    """Draw predictions of some episodes, see sample_grid."""
     return sample_grid(*_matched(run, pictures, episodes[:_SHOWN]))
 
 
