@@ -102,9 +102,12 @@ def register(first: Picture, picture: Picture, plane: Plane,
     changed = (first.apart(picture) > CHANGED).astype(np.float32)
     region = KEPT + cv2.GaussianBlur(changed, (0, 0), 4)
     found: dict[int, Pose] = {}
-    while tried := {k: pose for k, one in enumerate(objects) if k not in found and (
-            pose := locate(matcher, one, [other.place for other in found.values()], region,
-                           [one.place])) is not None}:
+    for _ in objects:
+        avoid = [pose.place for pose in found.values()]
+        tried = {k: pose for k, one in enumerate(objects) if k not in found and (
+            pose := locate(matcher, one, avoid, region, [one.place])) is not None}
+        if not tried:
+            break
         best = min(tried, key=lambda k: tried[k].cost)
         found[best] = tried[best]
     pixels, confidence = np.full((len(objects), 2), np.nan), np.zeros(len(objects))
@@ -114,8 +117,8 @@ def register(first: Picture, picture: Picture, plane: Plane,
         if confidence[k] > LEAST_SURE:
             states[k] = SEEN
             pixels[k] = plane.enlarge(plane.middle_pixels(pose.place))
-            outlines[k] = plane.enlarge(plane.top_pixels(objects[k].outlined(
-                pose.place, pose.angle)))
+            outlines[k] = plane.enlarge(plane.top_pixels(
+                pose.template.outlined(pose.place, pose.angle)))
     return Tracked(pixels, tuple(states), confidence, tuple(outlines))
 
 

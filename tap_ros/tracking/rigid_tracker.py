@@ -117,11 +117,10 @@ class RigidTracker:
             one.place = one.place + _pushed(one, hand)
         matcher = Matcher(picture, self._plane, self._covered(one, picture))
         keys = sorted(one.keys, key=lambda key: abs(_turned(key.angle - one.angle)))
-        found = self._search(one, keys, matcher, hand)
-        pose, key = found if found is not None else (None, keys[0])
+        pose = self._search(one, keys, matcher, hand)
         if pose is not None and pose.fit > GOOD:
-            one.place, one.angle, one.age, one.shown = pose.place, pose.angle, 0, key
-            one.state, one.confidence = SEEN, pose.confidence
+            one.place, one.angle, one.shown = pose.place, pose.angle, pose.template
+            one.age, one.state, one.confidence = 0, SEEN, pose.confidence
             nearest = min(abs(_turned(other.angle - one.angle)) for other in one.keys)
             one.around = self._window(one), picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
@@ -139,9 +138,9 @@ class RigidTracker:
         one.confidence = first * fall ** (one.age - 1)
 
     def _search(self, one: _Object, keys: Sequence[Template], matcher: Matcher,
-                hand: np.ndarray | None) -> tuple[Pose, Template] | None:
+                hand: np.ndarray | None) -> Pose | None:
         """
-        Return the best pose near by, else anywhere; and the template it was found with.
+        Return the best pose near by, else anywhere.
 
         :param keys: templates of the object, the nearest first.
         """
@@ -154,28 +153,23 @@ class RigidTracker:
                 push = hand[1, :2] - hand[0, :2]
             elif one.age == 0:
                 reach, turn = REST, REST_TURN
-
-        def attempt(place: np.ndarray, key: Template) -> tuple[Pose, Template] | None:
-            pose = matcher.refine(key, place, one.angle, reach, turn)
-            return None if pose is None else (pose, key)
-
-        best = attempt(one.place, keys[0])
-        if best is not None and best[0].fit > GOOD and best[0].cost < GOOD_COST:
+        best = matcher.refine(keys[0], one.place, one.angle, reach, turn)
+        if best is not None and best.fit > GOOD and best.cost < GOOD_COST:
             return best
         others = [(one.place, key) for key in (*keys[1:2], one.face)]
         if push is not None and np.linalg.norm(push) > 0.01:
             others.append((one.place + push, keys[0]))
         for place, key in others:
-            other = attempt(place, key)
-            if other is not None and (best is None or other[0].cost < best[0].cost - 0.03):
+            other = matcher.refine(key, place, one.angle, reach, turn)
+            if other is not None and (best is None or other.cost < best.cost - 0.03):
                 best = other
-        if one.age >= 1 and not (best is not None and best[0].fit > GOOD):
+        if one.age >= 1 and not (best is not None and best.fit > GOOD):
             avoid = [other.place for other in self._objects if other is not one]
             pose = locate(matcher, one.face, avoid)
             if (pose is not None and pose.fit > GOOD and pose.cost < MOST_COST
                     and np.linalg.norm(pose.place - one.place) < 0.08 * (one.age + 1) + 0.03
-                    and (best is None or pose.cost < best[0].cost - 0.1)):
-                return pose, one.face
+                    and (best is None or pose.cost < best.cost - 0.1)):
+                return pose
         return best
 
     def _covered(self, one: _Object, picture: Picture) -> np.ndarray:

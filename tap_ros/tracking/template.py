@@ -24,23 +24,6 @@ ROUND = 0.06  # cost at the edge of the search: of two places alike the nearer o
 _BIAS, _FIT, _COST, _SEEN = 1.74, 3.25, 7.59, 2.55
 
 
-@dataclass(frozen=True)
-class Pose:
-    """Where a template was found; angle relative to the picture that it was cut from."""
-
-    place: np.ndarray  # (2,) m
-    angle: float  # rad
-    cost: float  # 0 to 1.35
-    seen: float  # share of the points that the robot does not hide
-    fit: float  # share of those that have colours of the object
-
-    @property
-    def confidence(self) -> float:
-        """The probability that it is right within 2 px of a picture of 64."""
-        value = _BIAS + _FIT * self.fit - _COST * self.cost + _SEEN * self.seen
-        return float(1 / (1 + np.exp(-value)))
-
-
 class Template:
     """
     Points of an object, with their colours, and points around it.
@@ -85,6 +68,24 @@ class Template:
         """Return the outline (N, 2) of the object at a place, turned from the first picture."""
         c, s = np.cos(angle - self.angle), np.sin(angle - self.angle)
         return place + self.outline @ np.array([[c, s], [-s, c]])
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a template was found; angle relative to the picture that it was cut from."""
+
+    place: np.ndarray  # (2,) m
+    angle: float  # rad
+    cost: float  # 0 to 1.35
+    seen: float  # share of the points that the robot does not hide
+    fit: float  # share of those that have colours of the object
+    template: Template
+
+    @property
+    def confidence(self) -> float:
+        """The probability that it is right within 2 px of a picture of 64."""
+        value = _BIAS + _FIT * self.fit - _COST * self.cost + _SEEN * self.seen
+        return float(1 / (1 + np.exp(-value)))
 
 
 class Matcher:
@@ -213,7 +214,7 @@ class Matcher:
             best, turned = places[j], float(angles[i])
             reach, turn = reach * next_reach, turn * next_turn
         return Pose(best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
-                    self.fit(template, best, turned))
+                    self.fit(template, best, turned), template)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
