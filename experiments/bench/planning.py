@@ -7,6 +7,7 @@ import time
 
 from experiments.bench.mppi import mppi
 from experiments.bench.rows import Row, show
+from experiments.planning.methods import FIRST_SCENE, with_samples
 import numpy as np
 from sim_bridge.simulator import Simulator
 from tap_ros.base.contract import CLEAR
@@ -15,9 +16,8 @@ from tap_ros.base.options import ShippedFile
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.images.pixels import to_float
 from tap_ros.planning.action_sequences import HORIZON
-from tap_ros.planning.mpc_config import FIRST_SCENE, PRESETS, with_preset, with_samples
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 import torch
 from torch.profiler import profile, ProfilerActivity

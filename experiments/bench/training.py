@@ -13,8 +13,8 @@ import time
 from typing import Annotated
 
 from experiments.bench.rows import Row, show
+from experiments.paper.methods import method_fields
 from tap_ros.base.options import Bags
-from tap_ros.training.methods import method_fields
 from tap_ros.training.predictor import train
 from tap_ros.training.predictor_config import TrainingConfig
 from tap_ros.weights.devices import has_bfloat16, pick_device, pick_precision

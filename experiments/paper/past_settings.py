@@ -4,7 +4,7 @@
 
 from dataclasses import asdict
 
-from tap_ros.training.methods import method_fields
+from experiments.paper.methods import method_fields
 from tap_ros.training.predictor_config import TrainingConfig
 
 # Settings of earlier versions, and the value that they have now, or at which they did nothing.

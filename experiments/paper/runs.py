@@ -5,9 +5,9 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from experiments.paper.methods import method_fields
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED, TIMED
 from sim_bridge.tasks.tasks import get_task
-from tap_ros.training.methods import method_fields
 from tap_ros.training.predictor_config import TrainingConfig
 
 SINGLE = ('grasp', 'pick_place', 'push2')  # the tasks of Table 1

@@ -17,9 +17,8 @@ from tap_ros.images.robot_mask import FreeView, trained_robot_mask
 from tap_ros.planning.action_sequences import DOWN
 from tap_ros.planning.cost import BLOCKED
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
-from tap_ros.planning.visual_mpc import SHORT
+from tap_ros.planning.reach import End, Observation, Reach, ReachConfig, SelectTargets
+from tap_ros.planning.visual_mpc import Memory, Scene, SHORT
 
 
 @dataclass
@@ -95,15 +94,15 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
     while method.base != 'nothing' and not refused:
         tracked.append(seen.object_pixels)
         shown, start_picture = (each.update(seen.image, seen.robot_mask) for each in (view, asked))
-        looked = Seen(shown, seen.gripper, tuple(seen.object_names), seen.object_pixels,
-                      seen.stamp_ns, states=states)
+        looked = Observation(shown, seen.gripper, tuple(seen.object_names), seen.object_pixels,
+                             seen.stamp_ns, states=states)
         answer = reach.step(looked)
-        while isinstance(answer, Aim):
+        while isinstance(answer, SelectTargets):
             pictures = start_picture, asked.fill(goal.image, goal.robot_mask), shown
             targets, found = make_targets(
                 simulator, mpc, method, seen, goal, predictor, seed, pictures)
             subgoals += found
-            reach.head_for(targets)
+            reach.set_targets(targets)
             answer = reach.step(looked)
         if isinstance(answer, End):
             aborted = answer.message if answer.outcome == 'aborted' else ''
@@ -147,7 +146,8 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=(
             first, last_picture, start, end, num_samples=method.samples,
             recursion_depth=method.recursion, seed=seed)
         subgoals = choose_sample(
-            mpc, Scene(now, seen.gripper, start), end, found, seed)
+            mpc, Scene(now, seen.gripper, start), end, found,
+            lambda *leg: mpc.plan(*leg, Memory(seed)))
         return targets_by(subgoals, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []

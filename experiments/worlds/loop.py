@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 from experiments.pages import render, share
 from experiments.planning.episode import run_episode
-from experiments.planning.methods import Method
+from experiments.planning.methods import FIRST_SCENE, Method
 from experiments.worlds.pushes import push_to_goal, WORLDS
 import numpy as np
 import pandas as pd
@@ -29,7 +29,7 @@ from tap_ros.base.files import write_atomically, write_rows
 from tap_ros.base.options import Flag, Folder
 from tap_ros.evaluation.intervals import mean_interval, share_interval
 from tap_ros.images.drawing import enlarge, grid
-from tap_ros.planning.mpc_config import FIRST_SCENE, VisualMPCConfig
+from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor

@@ -17,8 +17,8 @@ from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.forward_scores import measure_maps, measure_pictures, MOVED_PIXELS
-from tap_ros.training.inpainted import FilledStore, with_masks
-from tap_ros.training.split import split_episodes, TEST_FRACTION
+from tap_ros.training.frames import FilledStore
+from tap_ros.training.split import split_episodes, TEST_FRACTION, with_masks
 from tap_ros.weights import FORWARD_MODEL
 from tap_ros.weights.weights import load_weights
 

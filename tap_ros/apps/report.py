@@ -25,8 +25,8 @@ from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_fil
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.marks import read_marks
-from tap_ros.training.inpainted import fill, with_masks
-from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few
+from tap_ros.training.frames import FilledStore
+from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few, with_masks
 
 _SHOWN = ('min_l1', 'copying_l1', 'changed_l1', 'match_fraction', 'match_fraction_std',
           'bottleneck_median', 'bottleneck_1px', 'bottleneck_2px', 'visible_bottleneck_2px',
@@ -61,7 +61,7 @@ def run(args: Prediction) -> None:
         raise ConfigError(
             'marks: none of the episodes that are scored is marked; mark some of them, in the '
             f'order of the recordings from 0: {listing(episodes)}; or give --all')
-    filled = fill(store, robot_mask)
+    filled = None if robot_mask == 'none' else FilledStore(store, robot_mask)
     scores = evaluate(network, store, episodes, goal_picture=args.goal_picture, filled=filled)
     sources = {store[i].object_source or 'unknown' for i in episodes if store[i].object_names}
     _print_table(scores, args.goal_picture, sources)

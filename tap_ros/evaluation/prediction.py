@@ -26,11 +26,11 @@ from tap_ros.images.pixels import to_float
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
-from tap_ros.prediction.protocol import Predictor, Question
+from tap_ros.prediction.protocol import Predictor, Request
 from tap_ros.prediction.warp import WarpedMaps
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.batches import Batch, make_batch, Pictures, Sampling
-from tap_ros.training.inpainted import Filled
+from tap_ros.training.frames import FilledStore
 import torch
 
 METHODS = ('prediction', 'copy-start', 'copy-goal')
@@ -112,7 +112,7 @@ class EpisodeScores:
 
 def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
              episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-             filled: Filled | None = None) -> dict[str, EpisodeScores]:
+             filled: FilledStore | None = None) -> dict[str, EpisodeScores]:
     """
     Measure a predictor, and copying, on episodes it was not trained on.
 
@@ -184,7 +184,7 @@ def _ask_another(predictor: Predictor, batch: Batch) -> tuple[torch.Tensor, Maps
     """Return what another predictor shows, as ask."""
     def answer(b: int, pixels: np.ndarray) -> Subgoal:
         names = ('start', 'goal')[:batch.context.shape[1]]
-        return predictor.predict_together([Question(
+        return predictor.predict_together([Request(
             **dict(zip(names, batch.context[b].numpy())),
             **{f'{name}_pixels': at for name, at in zip(names, pixels)})])[0][0]
 

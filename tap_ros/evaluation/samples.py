@@ -17,7 +17,7 @@ import torch
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
-    from tap_ros.training.inpainted import Filled
+    from tap_ros.training.frames import FilledStore
 
 NEAR = 6.0  # px
 
@@ -66,7 +66,7 @@ def draw_latents(episodes: Iterable[int], count: int, size: int) -> torch.Tensor
 
 def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: Iterable[int],
                   goal_picture: str = 'last', count: int = SAMPLES,
-                  filled: 'Filled | None' = None) -> SampleScores:
+                  filled: 'FilledStore | None' = None) -> SampleScores:
     """
     Measure many samples of each episode.
 

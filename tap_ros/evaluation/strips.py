@@ -19,7 +19,7 @@ from tap_ros.prediction.protocol import Predictor
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.recording.marks import Mark, Marks
 from tap_ros.training.batches import make_batch, Pictures, Sampling
-from tap_ros.training.inpainted import Filled
+from tap_ros.training.frames import FilledStore
 import torch
 
 _SIDE = 128  # least pixels a side of a picture in a strip
@@ -29,7 +29,7 @@ _MATCHED, _MARKED = (220, 38, 127), (190, 230, 190)  # rgb
 
 def write_strips(path: str | Path, network: PredictorNetwork | Predictor, store: EpisodeStore,
                  episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-                 filled: Filled | None = None, marks: Marks | None = None) -> None:
+                 filled: FilledStore | None = None, marks: Marks | None = None) -> None:
     """
     Write a sheet of strips, a row for each episode, see draw_strips.
 
@@ -41,7 +41,7 @@ def write_strips(path: str | Path, network: PredictorNetwork | Predictor, store:
 
 def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
                 episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-                filled: Filled | None = None, marks: Marks | None = None) -> np.ndarray:
+                filled: FilledStore | None = None, marks: Marks | None = None) -> np.ndarray:
     """
     Draw a sheet of strips, a row for each episode.
 

@@ -30,7 +30,7 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.apps.node_processes import NodeProcesses
 from tap_ros.nodes.predictor.requests import MAX_TOGETHER as TOGETHER
 from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.prediction.protocol import Question
+from tap_ros.prediction.protocol import Request
 from tap_ros.ros.calls import call, CallError
 from tap_ros.ros.client import Client, request_fields
 from tap_ros.ros.topics import SERVICE_QOS, STREAM, to_stamp
@@ -47,7 +47,7 @@ class Latency:
     What one client saw, in turns with the model alone; all in s.
 
     :param alone: (rounds * calls,), the model alone.
-    :param together: (rounds * calls / TOGETHER,), it with TOGETHER questions in a batch.
+    :param together: (rounds * calls / TOGETHER,), it with TOGETHER requests in a batch.
     :param service: (rounds * calls,), from the call to the answer.
     :param inside: of these, in the model.
     :param node: of these, in the node, after a request was decoded: median.
@@ -145,7 +145,7 @@ def compare_latency(stream, rounds, calls):
     :return: Latency.
     """
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
-    question = Question(*pictures(), *PIXELS)
+    request = Request(*pictures(), *PIXELS)
     alone, together, service, inside = [], [], [], []
     with Client() as client:
         ask, request = make_client(client, SERVICE_QOS.depth), make_request()
@@ -154,8 +154,8 @@ def compare_latency(stream, rounds, calls):
         call(ask, request, 120)
         for _ in range(rounds):
             os.kill(stream.pid, signal.SIGSTOP)
-            alone += timed(lambda: predictor.predict_together([question]), calls)
-            together += timed(lambda: predictor.predict_together([question] * TOGETHER),
+            alone += timed(lambda: predictor.predict_together([request]), calls)
+            together += timed(lambda: predictor.predict_together([request] * TOGETHER),
                               -(-calls // TOGETHER))
             os.kill(stream.pid, signal.SIGCONT)
             service += timed(lambda: inside.append(
