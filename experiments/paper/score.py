@@ -8,14 +8,19 @@ import time
 from experiments.paper.runs import SCALE
 import numpy as np
 from tap_ros.base.errors import ConfigError
-from tap_ros.evaluation.bottleneck import MIN_MOTION, target_bottlenecks
+from tap_ros.evaluation.bottleneck import (
+    can_be_bottleneck,
+    context_pixels,
+    least_sum,
+    MIN_MOTION,
+)
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training.batches import make_batch, Sampling
+from tap_ros.training.batches import fixed_time, make_batch, Sampling
 from tap_ros.training.split import split_episodes
 from tap_ros.weights import find_predictor
 from tap_ros.weights.devices import pick_device
@@ -55,7 +60,7 @@ def score(run, config, weights, places):
             for level in score_recursion(network, store, held_out)]
     if config.loss == 'fix' and config.mode == 'bidirectional':
         scores['target_bottleneck'] = _rounded_list(
-            target_bottlenecks([store[i] for i in held_out], config.fraction, 'last'))
+            [target_bottleneck(store[i], config.fraction) for i in held_out])
     if network.config.latent_size:
         samples = _rounded(score_samples(network, store, held_out))
         scores['best_of_100'] = {name: values for name, values in samples.items()
@@ -100,6 +105,16 @@ def _rounded(scores):
 def _rounded_list(values):
     return [None if np.isnan(x) else round(float(x), _DIGITS) if x % 1 else int(x)
             for x in values]
+
+
+def target_bottleneck(episode, fraction):
+    """Score the true frame at a fixed time, px: whether that time is a bottleneck by itself."""
+    pixels, end = context_pixels(episode, 'last'), len(episode.frames) - 1
+    if not can_be_bottleneck(pixels):
+        return np.nan
+    target = fixed_time(fraction, end, 1, end - 1)
+    gaps = torch.from_numpy(np.linalg.norm(episode.object_pixels[target] - pixels, axis=-1))
+    return least_sum(gaps[:1], gaps[1:]).item()
 
 
 @torch.inference_mode()

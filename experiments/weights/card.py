@@ -13,7 +13,8 @@ from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.samples import SAMPLES, score_samples
 from tap_ros.evaluation.shown import SHOWN
-from tap_ros.evaluation.strips import write_strips
+from tap_ros.evaluation.strips import draw_strips
+from tap_ros.images.drawing import png_bytes
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights.weights import load_weights, save_weights
@@ -66,11 +67,11 @@ def ship(name, task, run, fresh, out, commands):
         drawn = score_samples(network, store, episodes)
         placed = drawn.spread_px[np.isfinite(drawn.spread_px)]
         samples = {'count': SAMPLES, 'placed': f'{placed.mean():.1f}' if len(placed) else '',
-                   'near': f'{np.nanmean(drawn.spread_near):.4f}',
+                   'spread': f'{drawn.spread.mean():.4f}',
                    'best': '{:.4f} ({:.4f} to {:.4f})'.format(*mean_interval(drawn.min_l1))}
     good = found(first)
     shown = [*np.flatnonzero(good)[:PICTURED], *np.flatnonzero(~good)[:PICTURED]]
-    write_strips(file.with_suffix('.png'), network, store, shown, 'last')
+    write_atomically(file.with_suffix('.png'), png_bytes(draw_strips(network, store, shown)))
     card = file.with_suffix('.md')
     *collect, again, train = commands
     write_atomically(card, render(

@@ -160,7 +160,7 @@ def score(marked, held_out):
     :return: list of dicts: method, hit and near (at most a frame beside the bottleneck), each
         with value, low and high, n, and the mean frames of bottlenecks and demonstrations.
     """
-    from tap_ros.evaluation import keyframes
+    from experiments.worlds import keyframes
     methods = {
         'middle': [keyframes.middle], 'slowest': [keyframes.slowest], 'UVD-like': [keyframes.uvd],
         f'{MARKED} marks': [keyframes.from_marks([one.frames for one in demonstrations], frames)

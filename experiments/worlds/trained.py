@@ -82,7 +82,7 @@ def train_and_score(folder, method, seed, out):
     """Train a predictor; return which held-out episodes it hits, exactly and within a frame."""
     from sim_bridge.collect import BOTTLENECKS_FILE
     from tap_ros.apps.train import train
-    from tap_ros.evaluation.keyframes import is_hit
+    from tap_ros.evaluation.hits import is_hit
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.prediction.predictor import load_network
     from tap_ros.recording.bags import reading_like

@@ -45,11 +45,9 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'predictor': ('train a subgoal predictor', 'tap_ros.apps.train:predictor'),
         'forward': ("train the planner's forward model", 'tap_ros.apps.train:forward'),
     }),
-    'evaluate': ('score trained weights or a tracker', {
-        'prediction': ('score a predictor on recordings', 'tap_ros.apps.evaluate:prediction'),
-        'forward': ('score a forward model on recordings', 'tap_ros.apps.evaluate:forward'),
-        'tracking': ('score what follows objects on recordings or films',
-                     'tap_ros.apps.evaluate:tracking'),
+    'evaluate': ('score trained weights', {
+        'prediction': ('score a predictor on recordings', 'tap_ros.apps.evaluate_prediction'),
+        'forward': ('score a forward model on recordings', 'tap_ros.apps.evaluate_forward'),
     }),
     'predict': ('predict subgoals from picture files', 'tap_ros.apps.predict_command'),
     'call': ('ask a running predictor node', 'tap_ros.apps.call_command'),

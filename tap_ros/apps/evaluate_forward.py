@@ -1,16 +1,17 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the command `python -m tap_ros evaluate forward` does: how well it is told what comes."""
+"""The command `python -m tap_ros evaluate forward`: how well it is told what comes."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 import shlex
 from typing import Any
 
 import numpy as np
-from tap_ros.apps.evaluate import Forward
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_rows
+from tap_ros.base.options import Bags, Folder, ShippedFile, Topic
 from tap_ros.evaluation.intervals import against_copying, mean_interval
 from tap_ros.images.robot_mask import fill_from_past
 from tap_ros.planning.forward_model import LearnedForwardModel
@@ -39,7 +40,30 @@ MEANING = {
 FILE = 'forward_model.json'
 
 
-def run(args: Forward) -> None:
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    Pictures are filled behind the robot as the weights' training was.
+
+    :param recordings: bag folders; each is scored on its own: by object pixels, else by pictures.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param weights: of a forward model.
+    :param test_fraction: share of the episodes that training held out, by seed; 1: all.
+    :param device: cpu or cuda.
+    :param out: write forward_model.json there.
+    """
+
+    recordings: Bags
+    image_topic: Topic = ''
+    weights: ShippedFile = str(FORWARD_MODEL)
+    test_fraction: float = TEST_FRACTION
+    device: str = 'cpu'
+    out: Folder = ''
+
+
+def run(args: Options) -> None:
     """
     Print a table, and write what --out asks for.
 
@@ -61,9 +85,8 @@ def run(args: Forward) -> None:
         held_out = with_masks(store, parts, robot_mask)[1]
         filled = store if robot_mask == 'none' else FilledStore(
             store, robot_mask, filling=fill_from_past)
-        measured = measure_maps(model, filled, held_out)
-        if not measured:
-            measured = measure_pictures(model, filled, held_out)
+        measured = measure_maps(model, filled, held_out) or measure_pictures(
+            model, filled, held_out)
         if not measured:
             raise ConfigError(f'{recording}: no held-out episode of two frames or more; give more '
                               'of them, or --test-fraction 1')

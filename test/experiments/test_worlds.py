@@ -4,12 +4,11 @@
 
 import json
 
-from experiments.worlds import command
+from experiments.worlds import command, keyframes
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.base.errors import ConfigError
-from tap_ros.evaluation import keyframes
 from tap_ros.recording.cache import open_recordings
 
 
