@@ -17,7 +17,8 @@ from tap_msgs.msg import ObjectStates
 from tap_ros.apps.explorer.browser_commands import CommandError, parse_command
 from tap_ros.apps.explorer.display import GoalByHand
 from tap_ros.apps.explorer.node import ExplorerNode
-from tap_ros.apps.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
+from tap_ros.apps.explorer.server import ExplorerServer, MAX_BROWSERS, MAX_COMMAND
+from tap_ros.apps.server import is_loopback
 from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.base.errors import ConfigError
 from tap_ros.ros.calls import CallError
