@@ -24,6 +24,7 @@ from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode, TIMINGS
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
 from sim_bridge.world_protocol import ability, make_world, Observation, World
+from tap_ros.base.contract import TABLE
 from tap_ros.base.engines import Engine, LOCAL, run_tasks, Work
 from tap_ros.base.errors import check_fields, ConfigError, RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
@@ -38,7 +39,6 @@ from tqdm import tqdm
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
 BOTTLENECKS_FILE = 'bottlenecks.json'  # as tap_ros/recording/marks.py reads it
-TABLE = 'mujoco_table'
 MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 
 

@@ -11,21 +11,21 @@ The objects are tracked: a click on each in the first picture, here at its true 
 in the goal picture on what is not found there. Ground truth only measures, and draws for people.
 """
 
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Container, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 import os
 from pathlib import Path
 import platform
 import shlex
 import sys
+import threading
 import time
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from sim_bridge.collect import TABLE
-from sim_bridge.tasks.tasks import get_task, task_names
-from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
+from rclpy.parameter import Parameter
 from tap_ros.apps.demo.film import film, Scene
-from tap_ros.apps.demo.lane import run_scenes
 from tap_ros.apps.demo.report import (
     as_row,
     gains,
@@ -35,20 +35,29 @@ from tap_ros.apps.demo.report import (
     summary,
     write_report,
 )
-from tap_ros.apps.node_processes import errors_in
-from tap_ros.base.contract import ROBOT_MASKS, step_budget
+from tap_ros.apps.demo.watch import click, FOLLOWED_NO_MORE, Refused, right_order, Watch
+from tap_ros.apps.node_processes import errors_in, NodeEnded, NodeProcesses
+from tap_ros.base.contract import DEFAULT_LOOK, LOOKS, ROBOT_MASKS, step_budget, TABLE
 from tap_ros.base.errors import ConfigError, TapError
-from tap_ros.base.files import free_folder, write_rows
+from tap_ros.base.files import free_folder, write_atomically, write_rows
 from tap_ros.base.options import Folder, one_of
-from tap_ros.base.plugins import names
+from tap_ros.base.plugins import load_plugin, names
 from tap_ros.robots.arm import DEFAULT_ARM
+from tap_ros.ros.client import Client, positions_of
+from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tyro import conf
 
 FIRST_SCENE = 2_000_000  # seeds from here on are in no recording, no training and no table
 USUAL_TASKS = ('order2', 'order3')
-OTHERS_OBJECTS = 1  # of tasks of other worlds
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
-TOLD = {  # by whether objects are tracked
+CAMERA_SIZE = 256  # px of the camera's pictures; networks are shown what they were trained on
+CALL_S, STEP_S = 60.0, 15.0  # that a call, and one step of a run, may take, far more than usual
+LOOK_S = 1.0  # between two looks whether all nodes run
+RESEND_S = 0.5  # sending pictures again takes time from plans
+# In lock-step nothing moves while a node waits, so a busy machine changes nothing but the time.
+PATIENT = {'image_timeout': 300.0, 'max_age': 300.0, 'max_silence': 60.0,
+           'predictor_timeout': CALL_S}
+SOURCES = {  # by whether objects are tracked
     True: 'Objects are tracked from a click on each in the first picture (here its true pixel) '
           'and found in the goal picture; the ground truth of the simulator only measures '
           'distances and draws numbers and arrows.',
@@ -102,11 +111,19 @@ class Options:
     def plan(self) -> list[tuple[str, int]]:
         """Return the task and the seed of each scene."""
         return [(task, self.seed + i) for task in self.tasks or USUAL_TASKS
-                for i in range(max(1, self.scenes // max(1, self.num_objects(task) - 1)))]
+                for i in range(max(1, self.scenes // self.rounds(task)))]
 
     def num_objects(self, task: str) -> int:
         """Return how many objects are pushed."""
-        return get_task(task).num_objects if self.world == TABLE else OTHERS_OBJECTS
+        return load_plugin('tap_ros.tasks', task).num_objects if self.world == TABLE else 1
+
+    def rounds(self, task: str) -> int:
+        """Return how often a subgoal is predicted: while more than one object is to be moved."""
+        return max(1, self.num_objects(task) - 1)
+
+    def weights(self, task: str) -> str:
+        """Return the predictor's weights for a task."""
+        return self.predictor or (task if task in PREDICTORS else DEFAULT_PREDICTOR)
 
     def check(self) -> None:
         """Raise ConfigError for what cannot be run."""
@@ -116,7 +133,8 @@ class Options:
             raise ConfigError(f'world {self.world}: name its tasks, as --tasks push-v3')
         if len(set(self.tasks)) < len(self.tasks):
             raise ConfigError(f'tasks: {" ".join(self.tasks)}: name each once')
-        pushing = [task for task in task_names() if get_task(task).kind == 'push']
+        pushing = [task for task in names('tap_ros.tasks')
+                   if load_plugin('tap_ros.tasks', task).kind == 'push']
         for task in self.tasks if self.world == TABLE else ():
             if task not in pushing:
                 raise ConfigError(f'task {task}: is not one of those that push, '
@@ -132,7 +150,7 @@ def run(args: Options) -> int:
     :raises TapError: when no scene could be finished.
     """
     args.check()
-    folder = new_folder(args.out)
+    folder = free_folder(args.out)
     print(f'starting nodes; their logs are in {folder / "logs"}', flush=True)
     begin, scenes, left_out = time.monotonic(), list[Scene](), dict[str, str]()
     drawn, films = dict[str, Future[bytes]](), dict[str, bytes]()
@@ -144,7 +162,7 @@ def run(args: Options) -> int:
             folder / 'report.html', scenes, films,
             f'{len(scenes)} of {len(args.plan)} scenes, from seed {args.seed} on, which are in no '
             f'recording, training or table. Left out, as they could not be finished: {reasons}. '
-            f'{TOLD[args.tracked]} {REPEATS}', {
+            f'{SOURCES[args.tracked]} {REPEATS}', {
                 'date': time.strftime('%Y-%m-%d %H:%M'),
                 'time': f'{time.monotonic() - begin:.0f} s',
                 'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
@@ -170,7 +188,7 @@ def run(args: Options) -> int:
     if scenes:
         for caption, scene in shown(scenes).items():
             films[caption] = drawn[scene.task].result() if scene.task in drawn else film(scene)
-            (folder / f'{scene.task}.webp').write_bytes(films[caption])
+            write_atomically(folder / f'{scene.task}.webp', films[caption])
             print(f'film       {folder / scene.task}.webp')
         write_page()
         print(f'\n{results_table(summary(scenes))}\n')
@@ -184,8 +202,143 @@ def run(args: Options) -> int:
     return int(bool(wrong))
 
 
-def new_folder(wanted: str | Path) -> Path:
-    """Make a folder of this name, or with the next free number behind it."""
-    folder = free_folder(wanted)
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+def run_scenes(args: Options, folder: Path,
+               filmed: Container[str]) -> Iterator[Scene | TapError]:
+    """
+    Run all scenes, both modes at the same time; see SceneRunner.
+
+    :return: each scene, or why it could not be finished.
+    :raises TapError: when the nodes cannot be started at all.
+    """
+    runners = [SceneRunner(args, folder, mode, filmed) for mode in MODES]
+    with ExitStack() as stack:
+        for runner in runners:
+            stack.callback(runner.close)
+        for runner in runners:
+            runner.start()
+        for runner in runners:
+            runner.processes.wait_until_ready()
+        running = [[runner.pool.submit(runner.run, *scene) for scene in args.plan]
+                   for runner in runners]
+        for futures in zip(*running):
+            direct, via = (future.result() for future in futures)
+            if isinstance(direct, Scene) and isinstance(via, Scene):
+                yield replace(via, runs=direct.runs | via.runs)
+            else:
+                yield direct if isinstance(direct, TapError) else via
+
+
+class SceneRunner:
+    """
+    A set of nodes that runs scenes in one mode, in a thread of its own.
+
+    Whatever ends a scene before its end, the next one begins with new nodes.
+
+    :param folder: of the logs and the recording.
+    :param mode: one of MODES.
+    :param filmed: tasks of which there is a film, so that no more pictures are needed.
+    """
+
+    def __init__(self, args: Options, folder: Path, mode: str, filmed: Container[str]) -> None:
+        self._args, self._folder, self._mode, self._filmed = args, folder, mode, filmed
+        self._task, _ = args.plan[0]
+        self.pool = ThreadPoolExecutor(1, mode)
+        self._lock, self._closed = threading.Lock(), False
+        self._nodes: ExitStack | None = None  # with client and processes, while they are there
+
+    def start(self) -> None:
+        """Start the nodes and a client."""
+        args, table = self._args, self._args.world == TABLE
+        subgoals = self._mode == 'subgoal'
+        namespace = '' if subgoals else f'/{self._mode}'
+        world: dict[str, Any] = {'look': args.look, 'arm': args.arm, 'observer': True} if (
+            table) else {'world': args.world}
+        if args.tracked:
+            world |= {'objects': 'tracked', 'image_size': CAMERA_SIZE}
+        with self._lock:
+            if self._closed:
+                raise TapError('the demo is ending')
+            self._nodes = ExitStack()
+            self._client = self._nodes.enter_context(Client(namespace, CALL_S))
+            self._watch = Watch(self._client, args.tracked, 'observer/image_raw' if table else
+                                'camera/image_raw')
+            self.processes = self._nodes.enter_context(NodeProcesses(
+                free_folder(self._folder / 'logs' / self._mode), namespace))
+            start = self.processes.start
+            if subgoals:
+                start('recorder_node', folder=free_folder(self._folder / 'recording'))
+            start('sim_node', lock_step=True, resend_period=RESEND_S, task=self._task, **world)
+            if args.tracked:
+                start('tracker_node', patience=CALL_S)
+            if subgoals:
+                start('predictor_node', robot_mask=args.robot_mask,
+                      weights=args.weights(self._task))
+            start('visual_mpc_node', weights=args.forward_model, robot_mask=args.robot_mask,
+                  preset='quick', subgoal_rounds=args.rounds(self._task), **PATIENT)
+
+    def run(self, task: str, seed: int) -> Scene | TapError:
+        """Push the objects of a scene; return why not, where it cannot be finished."""
+        try:
+            if self._nodes is None:
+                self._task = task
+                self.start()
+                self.processes.wait_until_ready()
+            with ThreadPoolExecutor(1, 'pushing') as pool:
+                pushing = pool.submit(self._push, task, seed)
+                try:
+                    while not wait([pushing], LOOK_S).done:
+                        self.processes.check()
+                except NodeEnded:
+                    self.processes.end()  # this ends what waits for them, too
+                    raise
+            return pushing.result()
+        except TapError as error:
+            if not isinstance(error, Refused):
+                self._end_nodes()
+            return error
+
+    def close(self) -> None:
+        """End the nodes, and run no more scenes."""
+        with self._lock:
+            self._closed = True
+        self.pool.shutdown(wait=False, cancel_futures=True)
+        if self._nodes is not None:
+            self.processes.end()
+        self.pool.shutdown()
+        self._end_nodes()
+
+    def _end_nodes(self) -> None:
+        if self._nodes is not None:
+            self._nodes.close()
+            self._nodes = None
+
+    def _push(self, task: str, seed: int) -> Scene:
+        """Start a scene and have the arm push until its goal is reached or the budget spent."""
+        args, client, watch, mode = self._args, self._client, self._watch, self._mode
+        if task != self._task:
+            if mode == 'subgoal' and args.weights(task) != args.weights(self._task):
+                client.use_weights(args.weights(task))
+            client.call('set_planner', parameters=[
+                Parameter('subgoal_rounds', value=args.rounds(task)).to_parameter_msg()])
+            self._task = task
+        filming = task not in self._filmed
+        watch.film(filming)
+        watch.clear()
+        start, goal = client.reset(task, seed, objects=not args.tracked)
+        placed: dict[str, Any] = {}
+        if args.tracked:
+            start, goal, placed = click(client, watch, seed, start, goal)
+        if filming:
+            watch.at(watch.view, start.stamp_ns)  # before anything moves
+        budget = args.step_budget or step_budget(args.num_objects(task))
+        reaching = client.reach(mode=mode, step_budget=budget, seed=seed, goal_pixels=placed,
+                                timeout_s=client.timeout_s + STEP_S * budget)
+        feedback = list(reaching)
+        result = reaching.result()
+        # An object that cannot be followed any more is an end as good as any.
+        if result.end != 'succeeded' and not (feedback and FOLLOWED_NO_MORE in result.message):
+            raise TapError(f'reach_goal ({mode}): {result.message}')
+        run = watch.run(start, goal, feedback, result)
+        begun = positions_of(watch.at(watch.truth, start.stamp_ns))
+        return Scene(task, seed, goal.image, start.pixels, goal.pixels,
+                     right_order(begun, goal.positions), {mode: run})

@@ -30,14 +30,14 @@ function connect() {
 function take(message) {
   if (message.kind === 'state') {
     state = message;
-    if (problems !== null && message.problem.count > problems) complain(message.problem.text);
+    if (problems !== null && message.problem.count > problems) showError(message.problem.text);
     problems = message.problem.count;
     if (moved && JSON.stringify(state.goal.objects) !== moved.until) moved = null;
     showState();
   } else if (message.kind === 'selection') {
     takeSelection(message);
   } else if (message.kind === 'error') {
-    complain(message.text);
+    showError(message.text);
   }
 }
 
@@ -46,7 +46,7 @@ function send(command) {
   if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(command));
 }
 
-function complain(text) {
+function showError(text) {
   $('error').textContent = text;
   moved = null;
   drawAll();
