@@ -135,12 +135,7 @@ def confidence(rows):
 
 
 def loop(folder):
-    """
-    Compare pushing with tracked and with true objects.
-
-    :param folder: --out of `evaluate planning` with METHODS.
-    :return: what the page says of it, by name.
-    """
+    """Compare pushing with tracked and with true objects; return what the page says of it."""
     scenes = [{scene['seed']: scene for scene in json.loads(
         Path(folder, 'planning', f'push2-{name.replace(":", "--")}.json').read_text())['scenes']}
         for name in METHODS]

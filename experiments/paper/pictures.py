@@ -35,9 +35,6 @@ def write_picture(places, runs):
 
     One that is there stays where weights of a method, or the recording that they were scored on,
     are not at hand.
-
-    :param places: sweep.Places.
-    :param runs: dicts as results.load_runs returns them.
     """
     by_name = {run['name']: run for run in runs}
     shown = {method: PaperRun(TASK, MODE, method[0], variant=method[1]).name for method in METHODS}

@@ -66,14 +66,7 @@ _FINE_TUNED = {'goal_picture': 'mixed', 'start_crop': 0.3}  # as those were trai
 
 
 def label(method, variant='', recursion=1):
-    """
-    Name a method in results: genmin+skips is a variant, genmin-r2 was trained for recursion.
-
-    :param method: as for training.
-    :param variant: one of VARIANTS.
-    :param recursion: levels of Eq. 3 in training.
-    :return: for example 'genmin+progress+skips'.
-    """
+    """Name a method in results: genmin+skips is a variant, genmin-r2 was trained for recursion."""
     return method + variant + (f'-r{recursion}' if recursion > 1 else '')
 
 
@@ -128,13 +121,7 @@ class PaperRun:
         return f'python -m experiments paper --only {self.name}'
 
     def config(self, recordings, runs):
-        """
-        Say how to train.
-
-        :param recordings: folder with the recordings.
-        :param runs: folder of all runs.
-        :return: TrainingConfig.
-        """
+        """Return the TrainingConfig, by the folders of recordings and of all runs."""
         pushing = get_task(RECORDINGS[self.task].task).kind == 'push'
         settings = {**_SMALL, **_PAPER, **({} if pushing else _GRIPPING)}
         method = method_fields(self.method)

@@ -34,12 +34,8 @@ def ship(name, task, run, fresh, out, commands):
     """
     Write a run's weights as float16, with a card and a picture.
 
-    :param name: of the recipe; task: of its scenes.
-    :param run: folder of the training.
     :param fresh: folder of the recording of scenes that it never saw.
-    :param out: folder to write into.
     :param commands: lines: those that collect, that of the fresh scenes, that of the training.
-    :return: Path of the card.
     """
     run = Path(run)
     config, state, about = load_weights(run / 'predictor.safetensors', 'predictor')
@@ -86,25 +82,14 @@ def ship(name, task, run, fresh, out, commands):
 
 
 def found(scores):
-    """
-    Say of each episode whether its prediction is what it should be.
-
-    :param scores: EpisodeScores of predictions.
-    :return: bool (N,): a bottleneck within THRESHOLD where objects are pushed; else whether both
-        hand and objects are shown.
-    """
+    """Say of each episode whether its bottleneck is found, or hand and object are shown."""
     if np.isfinite(scores.bottleneck).any():
         return scores.bottleneck <= THRESHOLD
     return np.minimum(scores.hand, scores.objects) >= SHOWN
 
 
 def tabulate(scores):
-    """
-    Make the card's table.
-
-    :param scores: dict from a description of the goal picture to {method: EpisodeScores}.
-    :return: DataFrame, a line for each goal picture and method; what is not known has no column.
-    """
+    """Make the card's table of {goal picture: {method: EpisodeScores}}, without empty columns."""
     lines = {(goal, method): score.intervals()
              for goal, methods in scores.items() for method, score in methods.items()}
     table = pd.DataFrame(list(lines), columns=['goal picture', 'method'])

@@ -48,12 +48,7 @@ def uvd(frames):
 
 
 def from_marks(marked, marks):
-    """
-    Learn a time preference from marks; see preference.Preference.
-
-    :param marked: list of demonstrations; marks: the frame that is marked in each.
-    :return: function of a demonstration to the frame that is preferred.
-    """
+    """Learn a time preference from marked frames; return a function from pictures to a frame."""
     preference = learn_preference([describe(frames) for frames in marked], marks)
     return lambda frames: preference.best(describe(frames))
 

@@ -200,18 +200,16 @@ def test_real_nodes_push_tracked_objects_of_two_tasks_with_one_start(tmp_path, c
 @pytest.mark.slow
 def test_a_scene_ends_the_same_on_a_busy_machine_and_after_a_node_has_ended(tmp_path):
     options = command.Options(scenes=1, tasks=('push2',), step_budget=3)
-    runner = command.SceneRunner(options, tmp_path, 'direct', ('push2',))
-    runner.start()
+    nodes = command.NodeSet(options, tmp_path, 'direct', ('push2',))
     try:
-        runner.processes.wait_until_ready()
-        alone = runner.run('push2', SEED)
+        alone = command.run_scene([nodes], 'push2', SEED)
         with crowd(6):
-            beside = runner.run('push2', SEED)
-        runner.processes._processes['sim_node'].kill()
-        ended = runner.run('push2', SEED)
-        after = runner.run('push2', SEED)
+            beside = command.run_scene([nodes], 'push2', SEED)
+        nodes.processes._processes['sim_node'].kill()
+        ended = command.run_scene([nodes], 'push2', SEED)
+        after = command.run_scene([nodes], 'push2', SEED)
     finally:
-        runner.close()
+        nodes.close()
     assert 'sim_node ended with exit code -9' in str(ended)
     for other in (beside, after):
         assert np.array_equal(other.runs['direct'].distances, alone.runs['direct'].distances)

@@ -97,12 +97,7 @@ class Options:
 
 
 def run(args):
-    """Print the times of single calls, and what many clients get."""
-    measure(args)
-
-
-def measure(args):
-    """Return the rows of this benchmark, which it prints."""
+    """Print the times of single calls, and what many clients get; return rows."""
     with tempfile.TemporaryDirectory() as folder, NodeProcesses(folder) as nodes:
         nodes.start('predictor_node')
         with streaming(args.rate) as stream:
@@ -136,14 +131,7 @@ def measure(args):
 
 
 def compare_latency(stream, rounds, calls):
-    """
-    Time the model alone and the service in turns.
-
-    :param stream: process that publishes; it stands still while the model is alone.
-    :param rounds: turns of each.
-    :param calls: calls in each turn.
-    :return: Latency.
-    """
+    """Time the model alone and the service in turns, so many calls in a turn."""
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
     question = Question(*pictures(), *PIXELS)
     alone, together, service, inside = [], [], [], []
@@ -178,14 +166,7 @@ def timed(work, count, warm_up=5):
 
 
 def measure_load(clients, seconds, depth=SERVICE_QOS.depth):
-    """
-    Let many clients ask at once.
-
-    :param clients: how many, each with a client of its own.
-    :param seconds: how long they ask.
-    :param depth: answers that wait in the queue of a client; the default of ROS is 10.
-    :return: a Load.
-    """
+    """Let many clients ask at once for so many seconds, each with a queue of depth answers."""
     count = min(clients, MOST_PROCESSES)
     context = multiprocessing.get_context('spawn')
     barrier, results = context.Barrier(count), context.Queue()
@@ -204,12 +185,8 @@ def measure_load(clients, seconds, depth=SERVICE_QOS.depth):
 
 def ask_many(clients, seconds, depth, barrier, results):
     """
-    Be some of the clients, in a process of their own.
+    Be some of the clients, in a process of their own, from the barrier on.
 
-    :param clients: how many.
-    :param seconds: how long to ask.
-    :param depth: answers that wait in the queue of a client.
-    :param barrier: passed when all processes are ready.
     :param results: queue for (latencies, counts of other ends, s that it took, s of CPU time).
     """
     latencies, others = [], []

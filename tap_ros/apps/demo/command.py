@@ -11,7 +11,7 @@ The objects are tracked: a click on each in the first picture, here at its true 
 in the goal picture on what is not found there. Ground truth only measures, and draws for people.
 """
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -20,7 +20,6 @@ from pathlib import Path
 import platform
 import shlex
 import sys
-import threading
 import time
 from typing import Annotated, Any, Literal
 
@@ -36,7 +35,7 @@ from tap_ros.apps.demo.report import (
     write_report,
 )
 from tap_ros.apps.demo.watch import click, FOLLOWED_NO_MORE, Refused, right_order, Watch
-from tap_ros.apps.node_processes import errors_in, NodeEnded, NodeProcesses
+from tap_ros.apps.node_processes import errors_in, NodeProcesses
 from tap_ros.base.contract import DEFAULT_LOOK, LOOKS, ROBOT_MASKS, step_budget, TABLE
 from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.base.files import free_folder, write_atomically, write_rows
@@ -205,114 +204,104 @@ def run(args: Options) -> int:
 def run_scenes(args: Options, folder: Path,
                filmed: Container[str]) -> Iterator[Scene | TapError]:
     """
-    Run all scenes, both modes at the same time; see SceneRunner.
+    Run all scenes, both modes at the same time.
 
+    :param folder: of the logs and the recording.
+    :param filmed: tasks of which there is a film, so that no more pictures are needed.
     :return: each scene, or why it could not be finished.
     :raises TapError: when the nodes cannot be started at all.
     """
-    runners = [SceneRunner(args, folder, mode, filmed) for mode in MODES]
     with ExitStack() as stack:
-        for runner in runners:
-            stack.callback(runner.close)
-        for runner in runners:
-            runner.start()
-        for runner in runners:
-            runner.processes.wait_until_ready()
-        running = [[runner.pool.submit(runner.run, *scene) for scene in args.plan]
-                   for runner in runners]
-        for futures in zip(*running):
-            direct, via = (future.result() for future in futures)
-            if isinstance(direct, Scene) and isinstance(via, Scene):
-                yield replace(via, runs=direct.runs | via.runs)
-            else:
-                yield direct if isinstance(direct, TapError) else via
+        sets = [NodeSet(args, folder, mode, filmed) for mode in MODES]
+        for nodes in sets:
+            stack.callback(nodes.close)
+        start(sets, args.plan[0][0])
+        for task, seed in args.plan:
+            yield run_scene(sets, task, seed)
 
 
-class SceneRunner:
+def start(sets: Sequence['NodeSet'], task: str) -> None:
+    """Have all nodes ready, of those that are not there."""
+    for nodes in sets:
+        nodes.start(task)
+    for nodes in sets:
+        nodes.processes.wait_until_ready()
+
+
+def run_scene(sets: Sequence['NodeSet'], task: str, seed: int) -> Scene | TapError:
     """
-    A set of nodes that runs scenes in one mode, in a thread of its own.
+    Push the objects of a scene, by each set of nodes at the same time.
 
-    Whatever ends a scene before its end, the next one begins with new nodes.
+    :return: the scene, or why it cannot be finished; then the next one begins with new nodes.
+    """
+    try:
+        start(sets, task)
+        with ThreadPoolExecutor() as pool:
+            pushing = [pool.submit(nodes.push, task, seed) for nodes in sets]
+            try:
+                while wait(pushing, LOOK_S).not_done:
+                    for nodes in sets:
+                        nodes.processes.check()
+            except BaseException:
+                for nodes in sets:
+                    nodes.processes.end()  # this ends what waits for them, too
+                raise
+        scenes = [push.result() for push in pushing]
+        return replace(scenes[-1], runs={
+            mode: run for scene in scenes for mode, run in scene.runs.items()})
+    except TapError as error:
+        if not isinstance(error, Refused):
+            for nodes in sets:
+                nodes.close()
+        return error
 
-    :param folder: of the logs and the recording.
-    :param mode: one of MODES.
-    :param filmed: tasks of which there is a film, so that no more pictures are needed.
+
+class NodeSet:
+    """
+    Nodes that run scenes in one mode.
+
+    :param mode: one of MODES; and the others: see run_scenes.
     """
 
     def __init__(self, args: Options, folder: Path, mode: str, filmed: Container[str]) -> None:
         self._args, self._folder, self._mode, self._filmed = args, folder, mode, filmed
-        self._task, _ = args.plan[0]
-        self.pool = ThreadPoolExecutor(1, mode)
-        self._lock, self._closed = threading.Lock(), False
+        self._task = ''
         self._nodes: ExitStack | None = None  # with client and processes, while they are there
 
-    def start(self) -> None:
-        """Start the nodes and a client."""
-        args, table = self._args, self._args.world == TABLE
-        subgoals = self._mode == 'subgoal'
+    def start(self, task: str) -> None:
+        """Start the nodes and a client, unless they are there."""
+        if self._nodes is not None:
+            return
+        args, table, subgoals = self._args, self._args.world == TABLE, self._mode == 'subgoal'
         namespace = '' if subgoals else f'/{self._mode}'
         world: dict[str, Any] = {'look': args.look, 'arm': args.arm, 'observer': True} if (
             table) else {'world': args.world}
         if args.tracked:
             world |= {'objects': 'tracked', 'image_size': CAMERA_SIZE}
-        with self._lock:
-            if self._closed:
-                raise TapError('the demo is ending')
-            self._nodes = ExitStack()
-            self._client = self._nodes.enter_context(Client(namespace, CALL_S))
-            self._watch = Watch(self._client, args.tracked, 'observer/image_raw' if table else
-                                'camera/image_raw')
-            self.processes = self._nodes.enter_context(NodeProcesses(
-                free_folder(self._folder / 'logs' / self._mode), namespace))
-            start = self.processes.start
-            if subgoals:
-                start('recorder_node', folder=free_folder(self._folder / 'recording'))
-            start('sim_node', lock_step=True, resend_period=RESEND_S, task=self._task, **world)
-            if args.tracked:
-                start('tracker_node', patience=CALL_S)
-            if subgoals:
-                start('predictor_node', robot_mask=args.robot_mask,
-                      weights=args.weights(self._task))
-            start('visual_mpc_node', weights=args.forward_model, robot_mask=args.robot_mask,
-                  preset='quick', subgoal_rounds=args.rounds(self._task), **PATIENT)
-
-    def run(self, task: str, seed: int) -> Scene | TapError:
-        """Push the objects of a scene; return why not, where it cannot be finished."""
-        try:
-            if self._nodes is None:
-                self._task = task
-                self.start()
-                self.processes.wait_until_ready()
-            with ThreadPoolExecutor(1, 'pushing') as pool:
-                pushing = pool.submit(self._push, task, seed)
-                try:
-                    while not wait([pushing], LOOK_S).done:
-                        self.processes.check()
-                except NodeEnded:
-                    self.processes.end()  # this ends what waits for them, too
-                    raise
-            return pushing.result()
-        except TapError as error:
-            if not isinstance(error, Refused):
-                self._end_nodes()
-            return error
+        self._nodes, self._task = ExitStack(), task
+        self._client = self._nodes.enter_context(Client(namespace, CALL_S))
+        self._watch = Watch(self._client, args.tracked,
+                            'observer/image_raw' if table else 'camera/image_raw')
+        self.processes = self._nodes.enter_context(NodeProcesses(
+            free_folder(self._folder / 'logs' / self._mode), namespace))
+        begin = self.processes.start
+        if subgoals:
+            begin('recorder_node', folder=free_folder(self._folder / 'recording'))
+        begin('sim_node', lock_step=True, resend_period=RESEND_S, task=task, **world)
+        if args.tracked:
+            begin('tracker_node', patience=CALL_S)
+        if subgoals:
+            begin('predictor_node', robot_mask=args.robot_mask, weights=args.weights(task))
+        begin('visual_mpc_node', weights=args.forward_model, robot_mask=args.robot_mask,
+              preset='quick', subgoal_rounds=args.rounds(task), **PATIENT)
 
     def close(self) -> None:
-        """End the nodes, and run no more scenes."""
-        with self._lock:
-            self._closed = True
-        self.pool.shutdown(wait=False, cancel_futures=True)
-        if self._nodes is not None:
-            self.processes.end()
-        self.pool.shutdown()
-        self._end_nodes()
-
-    def _end_nodes(self) -> None:
+        """End the nodes."""
         if self._nodes is not None:
             self._nodes.close()
             self._nodes = None
 
-    def _push(self, task: str, seed: int) -> Scene:
+    def push(self, task: str, seed: int) -> Scene:
         """Start a scene and have the arm push until its goal is reached or the budget spent."""
         args, client, watch, mode = self._args, self._client, self._watch, self._mode
         if task != self._task:
