@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros predict`: subgoals from picture files, as a labelled picture."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import io
 from pathlib import Path
@@ -79,13 +79,9 @@ def run(args: Options) -> None:
         raise ConfigError(f'--out {escaped(args.out)}: is a picture to predict from; give another')
     predictor = load_predictor(args.weights)
     size = predictor.image_size
-    pictures = {'start': read_picture(args.start)}
-    if args.goal:
-        pictures['goal'] = read_picture(args.goal)
-    pixels = {'start': read_pixels(args.objects, '--objects'),
-              'goal': read_pixels(args.goal_objects, '--goal-objects')}
-    if not args.goal and len(pixels['goal']):
-        raise ConfigError('--goal-objects: there is no goal picture; name it behind the start')
+    pictures, pixels = read_inputs(
+        {'start': args.start or '.', 'goal': args.goal},  # an empty name is refused as a folder
+        {'--objects': args.objects, '--goal-objects': args.goal_objects})
     if args.goal and len(pixels['start']) != len(pixels['goal']):
         raise ConfigError(
             f'--objects and --goal-objects: {len(pixels["start"])} and {len(pixels["goal"])} '
@@ -111,18 +107,29 @@ def run(args: Options) -> None:
     print(f'written: {escaped(args.out)}')
 
 
-def read_picture(path: str | Path) -> np.ndarray:
+def read_inputs(files: Mapping[str, str], positions: Mapping[str, Sequence[str]],
+                ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """
-    Read a picture file just as a compressed picture of a recording or a camera is read.
+    Read picture files, just as a compressed picture of a camera is read, and positions in them.
 
-    :param path: of a JPEG, PNG or WebP file.
-    :return: uint8 (H, W, 3) rgb.
-    :raises ImageError: when it is no picture, or is damaged; OSError: when it is not there.
+    :param files: of 'start' and 'goal', JPEG, PNG or WebP; '' where there is none.
+    :param positions: by their options the positions in these, see read_pixels.
+    :return: of those that are there uint8 (H, W, 3) rgb, and float32 (K, 2), (u, v).
+    :raises ImageError: for a file that is no picture, or is damaged.
+    :raises ConfigError: for positions that are none, or without a picture.
     """
-    try:
-        return decompress(Path(path).read_bytes(), Path(path).suffix[1:], _LARGEST)
-    except ImageError as error:
-        raise ImageError(f'{escaped(path)}: {error}') from error
+    pictures, pixels = {}, {}
+    for (name, file), (option, words) in zip(files.items(), positions.items(), strict=True):
+        if words and not file:
+            raise ConfigError(f'{option}: name the {name} picture that they are in, too')
+        if file:
+            pixels[name] = read_pixels(words, option)
+            try:
+                pictures[name] = decompress(
+                    Path(file).read_bytes(), Path(file).suffix[1:], _LARGEST)
+            except ImageError as error:
+                raise ImageError(f'{escaped(file)}: {error}') from error
+    return pictures, pixels
 
 
 def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
