@@ -12,7 +12,7 @@ in the goal picture on what is not found there. Ground truth only measures, and 
 """
 
 from collections.abc import Container, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 import os
@@ -152,7 +152,7 @@ def run(args: Options) -> int:
     folder = free_folder(args.out)
     print(f'starting nodes; their logs are in {folder / "logs"}', flush=True)
     begin, scenes, left_out = time.monotonic(), list[Scene](), dict[str, str]()
-    drawn, films = dict[str, Future[bytes]](), dict[str, bytes]()
+    filmed, films = set[str](), dict[str, bytes]()
 
     def write_page() -> None:
         write_rows(folder / 'scenes.json', map(as_row, scenes))
@@ -167,26 +167,25 @@ def run(args: Options) -> int:
                 'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
                 'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'})
 
-    with ThreadPoolExecutor(1) as pool:
-        for (task, seed), scene in zip(args.plan, run_scenes(args, folder, drawn)):
-            if isinstance(scene, TapError):
-                left_out[f'{task} {seed}'] = str(scene).splitlines()[0]
-                print(f'  {task} {seed}   left out: {scene}', flush=True)
-                continue
-            scenes.append(scene)
-            if task not in drawn and gains(scene):
-                drawn[task] = pool.submit(film, scene)
-            print(f'  {task} {seed}   ' + '   '.join(
-                f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps'
-                for mode, name in MODES.items() for run in [scene.runs[mode]]), flush=True)
-            write_page()  # whatever ends the demo, what was done is there
+    for (task, seed), scene in zip(args.plan, run_scenes(args, folder, filmed)):
+        if isinstance(scene, TapError):
+            left_out[f'{task} {seed}'] = str(scene).splitlines()[0]
+            print(f'  {task} {seed}   left out: {scene}', flush=True)
+            continue
+        scenes.append(scene)
+        if gains(scene):
+            filmed.add(task)
+        print(f'  {task} {seed}   ' + '   '.join(
+            f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps'
+            for mode, name in MODES.items() for run in [scene.runs[mode]]), flush=True)
+        write_page()  # whatever ends the demo, what was done is there
     wrong = [f'{log}: {line}' for log in sorted((folder / 'logs').rglob('*.log'))
              for line in errors_in(log.read_text(errors='replace'))]
     for line in wrong[:MOST_SHOWN]:
         print(line)
     if scenes:
         for caption, scene in shown(scenes).items():
-            films[caption] = drawn[scene.task].result() if scene.task in drawn else film(scene)
+            films[caption] = film(scene)
             write_atomically(folder / f'{scene.task}.webp', films[caption])
             print(f'film       {folder / scene.task}.webp')
         write_page()
@@ -207,7 +206,7 @@ def run_scenes(args: Options, folder: Path,
     Run all scenes, both modes at the same time.
 
     :param folder: of the logs and the recording.
-    :param filmed: tasks of which there is a film, so that no more pictures are needed.
+    :param filmed: tasks whose film will be of a scene before, so that no pictures are needed.
     :return: each scene, or why it could not be finished.
     :raises TapError: when the nodes cannot be started at all.
     """
