@@ -29,19 +29,12 @@ COLUMNS = ['task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n'
 
 @dataclass(frozen=True)
 class Group:
-    """
-    Runs that differ by the seed only; all scored on the same N episodes.
+    """Runs that differ by the seed only; all scored on the same N episodes."""
 
-    :param key: dict of task, mode, method, scale and, where something was trained, new_pixels.
-    :param scores: dict of float arrays (S, N), a row for each run; NaN where undefined.
-    :param runs: their names, with blanks between.
-    :param of: for the best of 100, the method that was sampled from.
-    """
-
-    key: dict
-    scores: dict
-    runs: str
-    of: str = ''
+    key: dict  # task, mode, method, scale and, where something was trained, new_pixels
+    scores: dict  # float arrays (S, N), a row for each run; NaN where undefined
+    runs: str  # their names, with blanks between
+    of: str = ''  # for the best of 100, the method that was sampled from
 
 
 def group_runs(runs):

@@ -72,25 +72,15 @@ def label(method, variant='', recursion=1):
 
 @dataclass(frozen=True)
 class PaperRun:
-    """
-    One training and its evaluation.
+    """One training and its evaluation."""
 
-    :param task: the recording, of recordings.RECORDINGS.
-    :param mode: 'bidirectional' or 'forward'.
-    :param method: see prediction.methods.
-    :param new_pixels: whether the network may paint; if not, it has object maps.
-    :param seed: of the training.
-    :param recursion: levels of Eq. 3.
-    :param variant: one of VARIANTS, other settings than the method's own.
-    """
-
-    task: str
-    mode: str
-    method: str
-    new_pixels: bool = True
-    seed: int = 0
-    recursion: int = 1
-    variant: str = ''
+    task: str  # the recording, of recordings.RECORDINGS
+    mode: str  # 'bidirectional' or 'forward'
+    method: str  # see prediction.methods
+    new_pixels: bool = True  # whether the network may paint; if not, it has object maps
+    seed: int = 0  # of the training
+    recursion: int = 1  # levels of Eq. 3
+    variant: str = ''  # one of VARIANTS, other settings than the method's own
 
     @property
     def name(self):

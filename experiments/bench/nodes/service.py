@@ -43,38 +43,23 @@ MOST_PROCESSES = 4  # of clients
 
 @dataclass(frozen=True)
 class Latency:
-    """
-    What one client saw, in turns with the model alone; all in s.
+    """What one client saw, in turns with the model alone; all in s."""
 
-    :param alone: (rounds * calls,), the model alone.
-    :param together: (rounds * calls / TOGETHER,), it with TOGETHER questions in a batch.
-    :param service: (rounds * calls,), from the call to the answer.
-    :param inside: of these, in the model.
-    :param node: of these, in the node, after a request was decoded: median.
-    """
-
-    alone: np.ndarray
-    together: np.ndarray
-    service: np.ndarray
-    inside: np.ndarray
-    node: float
+    alone: np.ndarray  # (rounds * calls,), the model alone
+    together: np.ndarray  # (rounds * calls / TOGETHER,), it with TOGETHER questions in a batch
+    service: np.ndarray  # (rounds * calls,), from the call to the answer
+    inside: np.ndarray  # of these, in the model
+    node: float  # of these, in the node, after a request was decoded: median
 
 
 @dataclass(frozen=True)
 class Load:
-    """
-    What many clients got.
+    """What many clients got."""
 
-    :param latencies: (answers,) s, of the calls that were answered with a prediction.
-    :param per_second: of these answers.
-    :param counts: of other ends: 'busy' (told to ask again), 'refused', 'lost' (no answer).
-    :param cpu_s: CPU time of the clients, for one answer.
-    """
-
-    latencies: np.ndarray
-    per_second: float
-    counts: Counter
-    cpu_s: float
+    latencies: np.ndarray  # (answers,) s, of the calls that were answered with a prediction
+    per_second: float  # of these answers
+    counts: Counter  # of other ends: 'busy' (told to ask again), 'refused', 'lost' (no answer)
+    cpu_s: float  # CPU time of the clients, for one answer
 
 
 @dataclass(frozen=True)
