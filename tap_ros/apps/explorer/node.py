@@ -158,11 +158,8 @@ class ExplorerNode(Node):
                        'note': display.silence(now, newest.get('camera'))},
             'goal': {**shown.size('goal'),
                      'objects': display.listed(goals, newest.get('goal_objects', [None])[0]),
-                     'pictured': 'goal' in newest,
-                     'note': '' if 'goal' in newest else 'none yet'},
-            'problem': problem,
-            'run': {'running': running, 'stage': stage,
-                    'text': stage or 'starting' if running else 'idle'},
+                     'pictured': 'goal' in newest},
+            'problem': problem, 'run': {'running': running, 'stage': stage},
             'diagnostics': [
                 {'name': name, 'level': level, 'message': text}
                 if now - came <= display.SILENT_S + 1 else

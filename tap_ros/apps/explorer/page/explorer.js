@@ -70,10 +70,10 @@ function enable(connected) {
 
 function showState() {
   const {run, goal, camera} = state;
-  show('run', run.text, run.running ? 'busy' : '');
+  show('run', run.running ? run.stage || 'starting' : 'idle', run.running ? 'busy' : '');
   enable(true);
   $('camera-note').textContent = camera.note;
-  $('goal-note').textContent = goal.note;
+  $('goal-note').textContent = goal.pictured ? '' : 'none yet';
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
   $('select').hidden = !state.tracker;
