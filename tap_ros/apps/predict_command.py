@@ -4,17 +4,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-import io
 from pathlib import Path
 import sys
 from typing import Annotated, TYPE_CHECKING
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from tap_ros.base.errors import ConfigError, ImageError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
 from tap_ros.base.text import escaped
 from tap_ros.images.crop import Crop
+from tap_ros.images.drawing import grid, OBJECT_COLOURS, overlay, png_bytes
 from tap_ros.images.encodings import decompress
 from tap_ros.images.pixels import in_picture, resize_image, resize_pixels
 from tap_ros.recording.reading import Part
@@ -24,8 +25,7 @@ from tyro import conf
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
 
-PANEL = 2.6  # inches, side of a picture
-DPI = 100
+PANEL, HEAD = 260, 26  # px, side of a picture, and above it for its title
 _LARGEST = 2 ** 29  # bytes of rgb, of a picture file; phones make larger ones than cameras stream
 FAINT = 0.5  # mass of a map, below which an object is hardly in the prediction
 
@@ -190,32 +190,35 @@ def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
     :param subgoals: list of Subgoal; a row for each, its maps beside it where there are objects.
     :return: bytes of a PNG file.
     """
-    from matplotlib.figure import Figure
-    from tap_ros.images.drawing import OBJECT_COLOURS, overlay
-    count = len(pixels['start'])
-    columns = len(pictures) + 1 + bool(count)
-    figure = Figure(figsize=(PANEL * columns, (PANEL + 0.3) * len(subgoals)), dpi=DPI,
-                    layout='constrained')
-    axes = figure.subplots(len(subgoals), columns, squeeze=False)
-    for row, subgoal in zip(axes, subgoals):
+    rows = []
+    for subgoal in subgoals:
         panels = [(name, picture, pixels[name]) for name, picture in pictures.items()]
         panels.append((_title(subgoal, len(subgoals)), subgoal.image, pixels['start'][:0]))
-        if count:
+        if len(pixels['start']):
             panels.append(('where the objects are then', overlay(
                 subgoal.image, subgoal.object_maps), subgoal.expected_pixels))
-        for panel, (title, picture, marks) in zip(row, panels):
-            panel.imshow(picture, interpolation='nearest')
-            panel.set_title(title, fontsize=10)
-            panel.set_axis_off()
-            for k, (u, v) in enumerate(marks):
-                colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)]) / 255
-                panel.annotate(
-                    str(k + 1), (u, v), xytext=(8, 8), textcoords='offset points', color='white',
-                    fontsize=9, arrowprops={'arrowstyle': '-', 'color': colour},
-                    bbox={'boxstyle': 'circle,pad=0.15', 'facecolor': colour, 'linewidth': 0})
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='png')
-    return buffer.getvalue()
+        rows.append([_panel(*panel) for panel in panels])
+    return png_bytes(grid(rows))
+
+
+def _panel(title: str, picture: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """Draw a picture below its title, and a number beside each pixel (K, 2)."""
+    height, width = picture.shape[:2]
+    scale = PANEL / max(height, width)
+    image = Image.new('RGB', (PANEL, HEAD + PANEL), 'white')
+    image.paste(Image.fromarray(picture).resize(
+        (round(scale * width), round(scale * height)),
+        Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX), (0, HEAD))
+    draw = ImageDraw.Draw(image)
+    draw.text((2, HEAD // 2), title, 'black', ImageFont.load_default(16), anchor='lm')
+    for k, (u, v) in enumerate((np.asarray(marks) + 0.5) * scale):
+        if np.isfinite((u, v)).all():
+            u, v = u + 12, v + HEAD - 12
+            colour = OBJECT_COLOURS[k % len(OBJECT_COLOURS)]
+            draw.line((u - 12, v + 12, u, v), colour, 2)
+            draw.ellipse((u - 9, v - 9, u + 9, v + 9), colour, 'white')
+            draw.text((u, v), str(k + 1), 'white', ImageFont.load_default(14), anchor='mm')
+    return np.array(image)
 
 
 def _title(subgoal: 'Subgoal', count: int) -> str:
