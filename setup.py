@@ -12,7 +12,6 @@ NODE_CLASSES = run_path('tap_ros/base/contract.py')['NODE_CLASSES']
 REQUIRED = [  # for pip
     'jinja2>=3.1',
     'lz4>=4.3',
-    'matplotlib>=3.6',
     'mcap>=1.1',
     'mujoco>=4',
     'numpy>=1.26',

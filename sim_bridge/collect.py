@@ -20,6 +20,7 @@ import numpy as np
 from sim_bridge.tasks.tasks import get_task, TIMINGS
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
 from sim_bridge.world_protocol import ability, make_world, World
+from tap_ros.base.contract import TABLE
 from tap_ros.base.engines import Engine, LOCAL, run_tasks, Work
 from tap_ros.base.errors import check_fields, ConfigError, RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
@@ -33,7 +34,6 @@ from tqdm import tqdm
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
 BOTTLENECKS_FILE = 'bottlenecks.json'  # as tap_ros/recording/marks.py reads it
-TABLE = 'mujoco_table'
 MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 Make = Callable[[str, int], World]  # of a task's name and the size of the pictures
 

@@ -44,12 +44,7 @@ class Options:
 
 
 def run(args):
-    """Print the times of plans of each preset, and what the solvers find."""
-    measure(args)
-
-
-def measure(args):
-    """Return the rows of this benchmark, which it prints."""
+    """Print the times of plans of each preset, and what the solvers find; return rows."""
     simulator = Simulator('push2')
     seen = simulator.reset(FIRST_SCENE)
     goal = simulator.goal().object_pixels
@@ -157,12 +152,7 @@ def compare_solvers(args):
 
 
 def plans(args, configs, scenes):
-    """
-    Plan in turns, after a plan of each to warm up.
-
-    :param scenes: (seed, Scene, goal pixels) of each.
-    :return: for each config (costs, times in ms), of every scene.
-    """
+    """Plan each (seed, Scene, pixels) in turns; return for each config (costs, times in ms)."""
     planners = [VisualMPC.load(args.weights, config, args.device) for config in configs]
     found = [([], []) for _ in planners]
     for number, (seed, scene, pixels) in enumerate((scenes[0], *scenes)):

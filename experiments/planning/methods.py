@@ -107,13 +107,7 @@ DEFAULTS = {field.name: field.default for field in fields(Method)}
 
 
 def parse_method(text):
-    """
-    Read a method.
-
-    :param text: base and options, for example 'fix', 'genmin:recursion2:half', 'true_model'.
-    :return: Method; fields that the base has no use for are at their defaults.
-    :raises ConfigError: for an unknown option or an impossible combination.
-    """
+    """Read a Method, for example 'fix', 'genmin:recursion2:half', 'true_model'; ConfigError."""
     base, *options = text.split(':')
     if base == 'true_model':
         base, options = 'direct', ['true_model', *options]

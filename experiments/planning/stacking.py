@@ -51,16 +51,7 @@ class StackedEpisode:
 
 
 def stack(simulator, method, seed, predictor=None):
-    """
-    Bring the pictures of a method about in one scene.
-
-    :param simulator: Simulator of a task in which something is put somewhere; reset here.
-    :param method: methods.Method.
-    :param seed: of the scene, of the order of moves where the method has none, and of the arm.
-    :param predictor: SubgoalPredictor, for methods that predict.
-    :return: StackedEpisode.
-    :raises ConfigError: when the predictor is missing.
-    """
+    """Bring the pictures of a method about in one scene; return the StackedEpisode."""
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     shown = _expert_subgoals(simulator, seed) if method.base == 'true_subgoals' else []
@@ -110,13 +101,7 @@ def _make(simulator, rng, move):
 
 
 def what_is_below(poses, move):
-    """
-    Say on what an object comes to stand.
-
-    :param poses: (K, 3 or more) m, where the objects are.
-    :param move: Move.
-    :return: (3,) m, the origin of the highest other object at the place, see also on_table.
-    """
+    """Return (3,) m, the origin of the highest other object at a place, see also on_table."""
     place = np.array(move.place)
     others = np.delete(poses[:, :3], move.object, axis=0)
     under = others[np.linalg.norm(others[:, :2] - place, axis=1) < OVER]

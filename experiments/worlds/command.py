@@ -97,7 +97,6 @@ def score_tasks(tasks, methods, args, prefix=''):
     Collect demonstrations, score keyframes of them and trainings on them.
 
     :param tasks: by their names seeds of their first demonstrations.
-    :param methods: that are trained; args: Options.
     :param prefix: of the tasks' names in the results, and of their folders.
     :return: list of rows of both kinds, and of each task a strip.
     """
@@ -134,12 +133,7 @@ class Demonstration(NamedTuple):
 
 
 def read(folder):
-    """
-    Read a bag and its true bottlenecks.
-
-    :return: list of Demonstrations.
-    :raises ConfigError: if they are not known.
-    """
+    """Read a bag as Demonstrations; ConfigError if its bottlenecks are not known."""
     path = Path(folder, BOTTLENECKS_FILE)
     if not path.exists():
         raise ConfigError(f'{path}: is not there; collect it by a world that knows bottlenecks')
@@ -153,11 +147,10 @@ def score(marked, held_out):
     Score keyframes.
 
     :param marked: of each seed, the Demonstrations that are marked, and the frames.
-    :param held_out: Demonstrations that are scored.
     :return: list of dicts: method, hit and near (at most a frame beside the bottleneck), each
         with value, low and high, n, and the mean frames of bottlenecks and demonstrations.
     """
-    from tap_ros.evaluation import keyframes
+    from experiments.worlds import keyframes
     methods = {
         'middle': [keyframes.middle], 'slowest': [keyframes.slowest], 'UVD-like': [keyframes.uvd],
         f'{MARKED} marks': [keyframes.from_marks([one.frames for one in demonstrations], frames)

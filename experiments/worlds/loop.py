@@ -93,11 +93,7 @@ def run(args):
 
 
 def make_weights(args):
-    """
-    Make bags and trainings, or go on with them.
-
-    :return: dict: 'forward', and of each task a predictor; paths.
-    """
+    """Make bags and trainings; return paths by task, and the forward model's."""
     bags = {task: Path(args.bags, task) for task in args.tasks}
     for task, folder in bags.items():
         for pushes, seed in BAGS.items():
@@ -115,12 +111,7 @@ def make_weights(args):
 
 
 def mark(folder):
-    """
-    Mark a dozen demonstrations where the hand is at the object, each off by at most a frame.
-
-    :param folder: of the bag.
-    :return: path of the file.
-    """
+    """Mark a dozen demonstrations where the hand is at the object, off by at most a frame."""
     store, rng, marks = open_recordings([folder]), np.random.default_rng(0), {}
     for i in range(len(store)):
         episode = store[i]
@@ -195,11 +186,7 @@ def run_scene(task, method, seed, forward, predictor, runs):
 
 
 def act(world, method, seed, mpc, predictor):
-    """
-    Act in one scene by one method, for as many control periods as a goal may take.
-
-    :return: list: pictures of start, subgoals, end and goal; last the distance, cm, at the start.
-    """
+    """Act as long as a goal may take; return pictures of start, subgoals, end and goal, cm."""
     budget = step_budget(1)
     if method in ('direct', 'subgoal'):
         predict = _predictor(predictor) if method == 'subgoal' else None

@@ -3,6 +3,7 @@
 """Show what a recording or a weights file holds."""
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 import json
 from pathlib import Path
@@ -16,9 +17,9 @@ from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import film_strip, grid, png_bytes
 from tap_ros.recording.bags import check_first_picture, find_bags, list_topics
-from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.reading import Reading, reading_of, ReadingOptions
+from tap_ros.recording.reading import reading_of, ReadingOptions
 from tap_ros.recording.topic_choice import find_topics
 from tap_ros.training.split import split_episodes, warn_if_few
 from tyro import conf
@@ -64,23 +65,23 @@ def run(args: Options) -> None:
     store = open_recordings([args.path], reading=reading)
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
-    objects = sorted({len(e.object_names) for e in episodes})
     print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     if store.camera_size not in (store.image_size, None):
         print('cut         from pictures of {1}x{0} pixels'.format(*store.camera_size))
-    print(f'told apart  {_told_apart(store, reading)}')
-    print(f'camera      {listing(sorted(cameras))}')
-    print(f'length      {lengths.min()} to {lengths.max()} frames, median {np.median(lengths):g}')
-    print(f'objects     {", ".join(map(str, objects))}')
+    apart = 'by marks' if store.marked else (
+        f'no marks: by pauses of more than {reading.gap:g} s (--gap); a bag alone without any is '
+        f'cut into parts of at most {reading.episode_seconds:g} s (--episode-seconds)')
     masked = sum(e.robot_masks is not None for e in episodes)
-    print(f'robot masks {masked} of {len(episodes)} episodes')
-    for name, values in (('task', [e.task for e in episodes]),
-                         ('outcome', [e.outcome for e in episodes])):
-        counts = Counter(values).most_common()
-        counts = listing(f'{escaped(k, 40) or "unknown"} {v}' for k, v in counts)
-        print(f'{name:<11} {counts}')
-    print(f'data hash   {store.data_hash}')
+    for name, value in (
+            ('told apart', apart), ('camera', listing(sorted(cameras))),
+            ('length', f'{lengths.min()} to {lengths.max()} frames, median '
+                       f'{np.median(lengths):g}'),
+            ('objects', listing(sorted({len(e.object_names) for e in episodes}))),
+            ('robot masks', f'{masked} of {len(episodes)} episodes'),
+            ('task', _counted(e.task for e in episodes)),
+            ('outcome', _counted(e.outcome for e in episodes)), ('data hash', store.data_hash)):
+        print(f'{name:<11} {value}')
     if args.picture:
         strips = [film_strip(_tinted(e) if args.robot_mask else e.frames)
                   for e in episodes[:args.episodes]]
@@ -92,12 +93,9 @@ def run(args: Options) -> None:
     warn_if_few(held_out)
 
 
-def _told_apart(store: EpisodeStore, reading: Reading) -> str:
-    """Say how episodes are told apart."""
-    if store.marked:
-        return 'by marks'
-    return (f'no marks: by pauses of more than {reading.gap:g} s (--gap); a bag alone without '
-            f'any is cut into parts of at most {reading.episode_seconds:g} s (--episode-seconds)')
+def _counted(values: Iterable[str]) -> str:
+    return listing(f'{escaped(value, 40) or "unknown"} {count}'
+                   for value, count in Counter(values).most_common())
 
 
 def _tinted(episode: Episode) -> np.ndarray:

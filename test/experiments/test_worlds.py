@@ -4,7 +4,7 @@
 
 import json
 
-from experiments.worlds import command
+from experiments.worlds import command, keyframes
 from experiments.worlds.ogbench import OGBench
 from made_episodes import move_squares, write_bag
 import numpy as np
@@ -12,7 +12,6 @@ import pytest
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from tap_ros.base.engines import Engine
 from tap_ros.base.errors import ConfigError
-from tap_ros.evaluation import keyframes
 from tap_ros.recording.cache import open_recordings
 
 
