@@ -15,13 +15,13 @@ import warnings
 import numpy as np
 from tap_ros.messages.joints import contradicted, PLACE, positions_at
 from tap_ros.messages.stamps import MAX_GAP
-from tap_ros.recording.clocks import put_right
-from tap_ros.recording.columns import Columns, join, NAMES, Track
-from tap_ros.recording.damage import FAR, seconds
+from tap_ros.recording.columns import Columns, NAMES
+from tap_ros.recording.defects import FAR, seconds
 from tap_ros.recording.episode import EpisodeTable, RecordingWarning
 from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.spans import assign, find_rounds, in_gaps, MAX_JITTER_NS, read_spans, Span
+from tap_ros.recording.tracks import correct_times, join, Track
 from tap_ros.robots.arm import get_arm, MOST_JOINTS
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
@@ -58,7 +58,7 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     tracks['twist'] = _without_stops(tracks['twist'])
     shown = tracks['frame']
     rounds = () if marks else shown.order[find_rounds(shown.stamp, shown.picked()[:, 0])]
-    tracks = put_right(tracks, parts[0].source, parts[0].topics, gaps)
+    tracks = correct_times(tracks, parts[0], gaps)
     frame = tracks['frame']
     spans = read_spans(frame, tracks['mark'], marks, gaps, reading, parts[0].source,
                        np.flatnonzero(np.isin(frame.order, rounds)))

@@ -16,18 +16,14 @@ end they are left out.
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 import warnings
 
 import numpy as np
-from tap_ros.recording.damage import FAR
+from tap_ros.recording.columns import Mark
+from tap_ros.recording.defects import FAR
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.reading import Reading
-
-if TYPE_CHECKING:
-    from tap_ros.recording.columns import Track
-
-Mark = tuple[str, int, str]  # task, seed, outcome
+from tap_ros.recording.tracks import Track
 
 MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
 _LATE_NS = 5 * 10**9  # likewise where stamps alone tell episodes apart, as no clock begins anew
@@ -49,14 +45,14 @@ class Span:
     outcome: str | None = ''  # None: of frames that may belong to no episode
 
 
-def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.ndarray,
+def read_spans(frame: Track, mark: Track, marks: Sequence[Mark], gaps: np.ndarray,
                reading: Reading, source: str, rounds: np.ndarray) -> list[Span]:
     """
     Read the marks: a list of spans in the order of the log.
 
     :param frame, mark: sorted by log time.
     :param marks: (task, seed, outcome) of each mark, by its row of values.
-    :param gaps: (G, 2) as damage.gaps.
+    :param gaps: (G, 2) as defects.gaps.
     :param reading: Reading; without marks, a longer pause than its gap between two frames begins
         an episode; without pauses, longer episodes than it says are cut into equal parts.
     :param source: what warnings call the recording.
@@ -82,7 +78,7 @@ def in_gaps(gaps: np.ndarray, log: np.ndarray) -> np.ndarray:
     """
     Tell which times lie where messages of any topic may be missing, ends included.
 
-    :param gaps: (G, 2) int64, as damage.gaps gives it.
+    :param gaps: (G, 2) int64, as defects.gaps gives it.
     :param log: (N,) int64, ns.
     :return: (N,) bool.
     """
@@ -92,7 +88,7 @@ def in_gaps(gaps: np.ndarray, log: np.ndarray) -> np.ndarray:
     return log <= ends[before]
 
 
-def _marked(mark: 'Track', marks: Sequence[Mark], gaps: list[list[int]]) -> list[Span]:
+def _marked(mark: Track, marks: Sequence[Mark], gaps: list[list[int]]) -> list[Span]:
     """Return the spans between marks; where marks may be lost nothing is known until the next."""
     # At the same time starts come before gaps and ends behind: what cannot be told is left out.
     events: list[tuple[int, int, int, int, Mark]] = [
@@ -201,7 +197,7 @@ def _cut(span: Span, gaps: list[list[int]]) -> Iterator[Span]:
     yield span
 
 
-def assign(spans: Sequence[Span], track: 'Track') -> np.ndarray:
+def assign(spans: Sequence[Span], track: Track) -> np.ndarray:
     """Return (N,) int64: the episode of each message, -1 for none."""
     log, stamps = track.log, track.stamp
     start_log, end_log, start_stamp, end_stamp = np.array(

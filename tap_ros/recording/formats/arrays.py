@@ -27,9 +27,8 @@ from tap_ros.base.contract import MAX_PICTURE_BYTES
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.encodings import decompress
+from tap_ros.recording.bags import what_else, what_is
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.file_bytes import what_else
-from tap_ros.recording.foreign import what_is
 from tap_ros.recording.formats.pictures import (
     decoded,
     find_files,

@@ -26,9 +26,9 @@ from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
+from tap_ros.recording.bags import what_else
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
-from tap_ros.recording.file_bytes import what_else
 from tap_ros.recording.formats.pictures import (
     DAMAGE,
     decoded,

@@ -26,10 +26,9 @@ from tap_ros.base.files import only_writer, storage_errors
 from tap_ros.base.options import default_text, Folder
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
-from tap_ros.recording.damage import describe, Loss
+from tap_ros.recording.bags import VIDEOS, what_else, what_is
+from tap_ros.recording.defects import Defect, describe
 from tap_ros.recording.episode import Episode, RecordingWarning
-from tap_ros.recording.file_bytes import what_else
-from tap_ros.recording.foreign import VIDEOS, what_is
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading import Part
 from tap_ros.recording.trust import inside, MOST_BYTES, MOST_FRAMES, regular
@@ -167,11 +166,11 @@ class Lacking:
     """What of an import cannot be used; the rest is written, and this counted and named."""
 
     def __init__(self) -> None:
-        self._losses: list[Loss] = []
+        self._defects: list[Defect] = []
 
     def note(self, why: object, what: str, where: str) -> None:
         """Note why a part cannot be used: what it is, such as a picture, and where it stands."""
-        self._losses.append(Loss(escaped(why), what, where=where))
+        self._defects.append(Defect(escaped(why), what, where=where))
 
     @contextmanager
     def passing_over(self, what: str, where: str) -> Iterator[None]:
@@ -187,7 +186,7 @@ class Lacking:
 
         :raises RecordingError: when nothing at all could be used.
         """
-        lines = [f'{escaped(out)}: {line}' for line in describe(self._losses)]
+        lines = [f'{escaped(out)}: {line}' for line in describe(self._defects)]
         if is_empty:
             raise RecordingError(
                 lines[0] if lines else f'{escaped(out)}: there is no episode to import')

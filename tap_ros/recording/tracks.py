@@ -1,69 +1,117 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Correct stamps and log times of recorded messages where they are wrong.
+The messages of the files of a bag as tracks, one a name, whose times can be compared.
 
 Only the order in which messages were written is always right. Log times come from one clock, the
 recorder's; where that was set, what was logged before is moved. Stamps come from the clock of each
-topic's driver. Where those of a topic jump, stand still or are of another clock than the camera's,
-its times are taken from the log; where the camera's do, those of every topic are. Every message is
-kept, each correction gives a warning that names the topic, and times that are right stay.
+topic's driver. Where those of a topic go back, stand still or are of another clock than the
+camera's, its times are taken from the log; where the camera's do, those of every topic are. Every
+message is kept, each correction gives a warning that names the topic, and right times stay.
 """
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 import warnings
 
 import numpy as np
 from tap_ros.base.text import escaped
 from tap_ros.messages.stamps import PROOF
-from tap_ros.recording.columns import Track
+from tap_ros.recording.columns import Columns, Mark, NAMES, WIDTHS
 from tap_ros.recording.episode import RecordingWarning
 
-NOMINAL_NS = 10**8  # between frames of which neither stamps nor log times tell anything
 _APART_NS = 7 * 10**8  # late messages and slow cameras explain no larger difference of two clocks
 _BEHIND_NS = 35 * 10**7  # only a camera is late; what else is behind it has another clock
 _SET_NS = 10**8  # a clock that is set back by less is not told from jitter
 _YEARS_NS = 30 * 86400 * 10**9  # nobody records so long a pause: the clock got the time
 _BOGUS_NS = 5 * 10**8  # a single time is wrong by more
-_EDGE_NS = 5 * 10**9  # likewise one of the first or the last: they may be late, or old
 _PAUSE_NS = 5 * 10**8  # of a camera, in which its clock may be set back unseen
 _OVERTAKEN_NS = 10**8  # a frame may be logged so long before the mark that precedes it
-_ANSWER_NS = 5 * 10**9  # what is about a picture may be logged so much later
-_FEW, _LONG = 3, 30  # messages beside a place that are too few, or enough, to tell what it is
+_LONG = 30  # messages beside a place that tell what it is
 _MANY = 10  # messages of one stamp, of which no driver sends so many together
 _SMOOTH = 9  # messages that tell how far two clocks are apart
 _STREAMS = ('frame', 'twist', 'joint', 'arm', 'object')
 _OF_ANOTHER = 'are of another clock than the camera, which is ahead or behind'
 
 
-def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str],
-              gaps: np.ndarray) -> dict[str, Track]:
+@dataclass
+class Track:
+    """The messages of one name in files that follow each other; N of them."""
+
+    log: np.ndarray  # (N,) int64, ns
+    stamp: np.ndarray  # (N,) int64, ns
+    order: np.ndarray  # (N,) int64: increases as they were written, over all names
+    index: np.ndarray  # (N,) int64, see Columns
+    file: np.ndarray  # (N,) int64, index into the parts
+    first: np.ndarray  # (N,) int64, row of values, the first of several objects
+    values: np.ndarray  # (M, width) float64
+
+    def __len__(self) -> int:
+        return len(self.log)
+
+    def take(self, rows: np.ndarray) -> 'Track':
+        """Return some of the messages."""
+        return Track(self.log[rows], self.stamp[rows], self.order[rows], self.index[rows],
+                     self.file[rows], self.first[rows], self.values)
+
+    def picked(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Return the values of some messages, (N, width)."""
+        return self.values[self.first[rows]]
+
+
+def join(parts: Sequence[Columns]) -> tuple[dict[str, Track], list[tuple[str, ...]], list[Mark]]:
+    """Put the columns of several files one behind the other; return names and marks, too."""
+    numbers: dict[tuple[str, ...], int] = {}
+    tracks = {}
+    for part in parts:
+        for names in part.names:
+            numbers.setdefault(tuple(names), len(numbers))
+    counts = np.array([len(names) - 1 for names in numbers], np.int64)
+    for name in NAMES:
+        rows, values = [np.empty((0, 5), np.int64)], [np.empty((0, WIDTHS.get(name, 1)))]
+        for file, part in enumerate(parts):
+            found = part.arrays.get(name, np.empty((0, 4), np.int64)).copy()
+            found[:, 2] += file << 40  # later files are behind earlier ones
+            if 'object' in name:
+                local = np.array([numbers[tuple(n)] for n in part.names], np.int64)
+                found[:, 3] = local[found[:, 3]]
+            rows.append(np.insert(found, 4, file, axis=1))
+            values.append(part.arrays.get(f'{name}_values', values[0]))
+        log, stamp, order, index, owner = np.concatenate(rows).T
+        lengths = counts[index] if 'object' in name else np.ones(len(log), np.int64)
+        tracks[name] = Track(log, stamp, order, index, owner, np.cumsum(lengths) - lengths,
+                             np.concatenate(values))
+    return tracks, list(numbers), [mark for part in parts for mark in part.marks]
+
+
+def correct_times(tracks: Mapping[str, Track], part: Columns,
+                  gaps: np.ndarray) -> dict[str, Track]:
     """
     Return the messages of all names, sorted by log time.
 
     :param tracks: by name, in the order in which they were written; stamps 0 where there are none.
-    :param source: what warnings call the recording.
-    :param topics: by name; likewise.
-    :param gaps: (G, 2) as damage.gaps: where marks may be lost.
+    :param part: of the first file, which warnings name.
+    :param gaps: (G, 2) as defects.gaps: where marks may be lost.
     """
     said: list[str] = []
-    called = {name: f'topic {escaped(topics.get(name, name))}' for name in tracks}
+    called = {name: f'topic {escaped(part.topics.get(name, name))}' for name in tracks}
     called['arm'] = called['joint']
     tracks = _one_log(dict(tracks), said)
     frame, mark = _without_resent(tracks['frame']), tracks['mark']
     tracks['frame'] = frame
+    same = np.count_nonzero(np.diff(frame.stamp) == 0)
     if not frame.stamp.any():
         tracks |= _all_by_log(tracks)
-    elif len(same := np.flatnonzero(np.diff(frame.stamp) == 0)) or _jumps(frame, mark, gaps, True):
+    elif same or _goes_back(frame, mark, gaps, True) or _was_set(frame, mark, gaps):
         if not said:  # else it is the same cause
             said.append(
-                f'{called["frame"]}: of {len(frame)} stamps {len(same)} are repeated, '
+                f'{called["frame"]}: of {len(frame)} stamps {same} are repeated, '
                 f'{np.count_nonzero(frame.stamp == 0)} are zero and '
                 f'{np.count_nonzero(np.diff(frame.stamp) < 0)} go back, or its clock was set; log '
                 'times take their place, for all topics')
         tracks |= _all_by_log(tracks)
     else:
-        found = {name: _stamped(name, tracks, gaps) for name in (*_STREAMS[1:], 'mark')
+        found = {name: _comparable(name, tracks, gaps) for name in (*_STREAMS[1:], 'mark')
                  if len(tracks[name])}
         for name, (track, why) in found.items():
             tracks[name] = track
@@ -71,38 +119,30 @@ def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str],
                 said.append(f'{called[name]}: its {len(track)} stamps {why}; log times take their '
                             'place')
         if found and all(why for _, why in found.values()):  # the camera's clock is the odd one
+            ahead = int(np.median(frame.stamp - frame.log))
             for name in ('goal', 'goal_mask', 'goal_object'):
-                track, ahead = tracks[name], int(np.median(frame.stamp - frame.log))
-                tracks[name] = replace(
-                    track, stamp=np.where(track.stamp == 0, 0, track.stamp + ahead))
+                stamp = tracks[name].stamp
+                tracks[name] = replace(tracks[name], stamp=stamp + ahead * (stamp != 0))
     for text in dict.fromkeys(said):
-        warnings.warn(f'{escaped(source)}: {text}', RecordingWarning, stacklevel=3)
+        warnings.warn(f'{escaped(part.source)}: {text}', RecordingWarning, stacklevel=3)
     return {name: _sorted(track) for name, track in tracks.items()}
 
 
 def _sorted(track: Track) -> Track:
-    """Return messages sorted by log time."""
     return track.take(np.argsort(track.log, kind='stable'))
 
 
 def _one_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
     """Return messages whose log times go on where the clock of the recorder was set."""
-    tracks, wrong, found = _moving_log(tracks, said), 0, []
-    for name in _STREAMS:
-        log, single = _without_single(tracks[name].log)
-        tracks[name], wrong = replace(tracks[name], log=log), wrong + single
-    if wrong:
-        said.append(f'{wrong} of its log times cannot be right; those messages stay in the order '
-                    'in which they were written')
+    found = []
     for name in sorted(_STREAMS, key=lambda name: -len(tracks[name])):  # the densest sees it best
         steps = np.diff(tracks[name].log)
         for i in (np.flatnonzero((steps < -_SET_NS) | (steps > _YEARS_NS)) + 1).tolist():
             change = int(steps[i - 1] - np.median(steps))
             place = _first_behind(tracks, tracks[name], i, change)
             found.append(change)
-            tracks = {key: replace(track, log=np.where(
-                track.order < place, track.log + change, track.log))
-                for key, track in tracks.items()}
+            tracks = {key: replace(track, log=track.log + change * (track.order < place))
+                      for key, track in tracks.items()}
     if found:
         most = max(found, key=abs)
         often = f'{len(found)} times, by up to' if len(found) > 1 else 'by'
@@ -110,30 +150,6 @@ def _one_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
                     f'{often} {abs(most) / 1e9:.1f} s; messages go on in the order in which they '
                     'were written')
     return tracks
-
-
-def _moving_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
-    """Replace log times that stand still by stamps, or else by ten pictures a second."""
-    frame = tracks['frame']
-    if len(frame) <= PROOF or (np.diff(frame.log) == 0).mean() <= 0.5:
-        return tracks
-    moves = (np.diff(frame.stamp) > 0).all()
-    times = frame.stamp if moves else np.arange(len(frame)) * NOMINAL_NS
-    said.append('log times stand still; ' + (
-        'stamps take their place' if moves else 'messages are read in the order of writing'))
-    return {name: replace(track, log=np.interp(
-        track.order, frame.order, times - times[0]).astype(np.int64) + times[0])
-        for name, track in tracks.items()}
-
-
-def _without_single(log: np.ndarray) -> tuple[np.ndarray, int]:
-    """Put single times (N,) that are far from those around between them; return their number."""
-    if len(log) <= 2 * _FEW:
-        return log, 0
-    before, after, own = log[:-2], log[2:], log[1:-1]
-    wrong = (before <= after) & (np.abs(own - np.clip(own, before, after)) > _BOGUS_NS)
-    between = np.where(wrong, before + (after - before) // 2, own)
-    return np.concatenate([log[:1], between, log[-1:]]), int(wrong.sum())
 
 
 def _first_behind(tracks: dict[str, Track], track: Track, i: int, change: int) -> int:
@@ -166,40 +182,29 @@ def _all_by_log(tracks: dict[str, Track]) -> dict[str, Track]:
 
 
 def _restamped(track: Track, before: Track, after: Track) -> Track:
-    """Return what is about pictures with the stamps that these have now."""
+    """Return what is about pictures with the stamp that its own has now, if that is the newest."""
     if not len(track) or not len(after):
         return track
-    order = np.lexsort((after.order, before.stamp))
-    stamps, places = before.stamp[order], after.order[order]
-    first, last = (np.searchsorted(stamps, track.stamp, side) for side in ('left', 'right'))
-    # Of pictures of one stamp that which was written last before it, or else the first.
-    keys = np.lexsort((np.append(places, track.order), np.append(stamps, track.stamp)))
-    rank = np.empty(len(keys), np.int64)
-    rank[keys] = np.cumsum(keys < len(stamps))
-    found = order[np.clip(rank[len(stamps):] - 1, first, np.maximum(last - 1, first)).clip(
-        max=len(order) - 1)]
-    later = track.log - after.log[found]
-    known = (last > first) & (later < _ANSWER_NS) & (later > -_OVERTAKEN_NS)
-    return replace(track, stamp=np.where(known, after.stamp[found], track.log))
+    newest = np.maximum(np.searchsorted(after.order, track.order) - 1, 0)
+    return replace(track, stamp=np.where(
+        before.stamp[newest] == track.stamp, after.stamp[newest], track.log))
 
 
-def _stamped(name: str, tracks: dict[str, Track], gaps: np.ndarray) -> tuple[Track, str]:
+def _comparable(name: str, tracks: dict[str, Track], gaps: np.ndarray) -> tuple[Track, str]:
     """Return what has stamps that can be compared with those of frames, and what was wrong."""
     track, frame = tracks[name], tracks['frame']
-    shown = _sorted(frame)
+    shown, zero = _sorted(frame), track.stamp == 0
     newest = np.maximum(np.searchsorted(shown.log, track.log, 'right') - 1, 0)
     by_log = track.log + (shown.stamp - shown.log)[newest]
-    zero = track.stamp == 0
     if name == 'mark':
         off = ~zero & (np.abs(_away(track, frame)[0]) > _APART_NS)
-        return (replace(track, stamp=np.where(zero, 0, by_log)), _OF_ANOTHER) if off.any() else (
-            track, '')
+        return (replace(track, stamp=by_log * ~zero), _OF_ANOTHER) if off.any() else (track, '')
     repeats = _repeats(track, name)
     if zero.any():  # a command answers a frame
         track = replace(track, stamp=np.where(
             zero, by_log if name in ('joint', 'arm') else shown.stamp[newest], track.stamp))
     why = 'are repeated' if repeats else (
-        'go back' if _jumps(track, tracks['mark'], gaps, False) else
+        'go back' if _goes_back(track, tracks['mark'], gaps, False) else
         _OF_ANOTHER if _is_apart(track, frame) else '')
     return replace(track, stamp=by_log) if why else track, why
 
@@ -215,76 +220,54 @@ def _repeats(track: Track, name: str) -> bool:
     return bool(differ.mean() > 0.5 or counts.max() > _MANY)
 
 
-def _jumps(track: Track, mark: Track, gaps: np.ndarray, camera: bool) -> bool:
-    """
-    Tell whether the clock of a topic was set, other than where an episode begins.
-
-    :param camera: one that is set ahead, or back in a pause, shows by its log times alone; other
-        topics are compared with it.
-    """
-    stamp, steps = track.stamp, np.diff(track.stamp)
+def _goes_back(track: Track, mark: Track, gaps: np.ndarray, camera: bool) -> bool:
+    """Tell whether stamps go back, other than where an episode begins, or one was overtaken."""
+    steps = np.diff(track.stamp)
     places = np.flatnonzero(steps < 0) + 1
-    moved = _moved(track) if camera and len(steps) else places[:0]
-    if not len(places) and not len(moved):
+    if not len(places):
         return False
-    if (~_anew(track, moved, mark, gaps)).any():
-        return True
     period = float(np.median(steps))
-    for part in np.split(stamp, places[_anew(track, places, mark, gaps)]):
+    for part in np.split(track.stamp, places[_between_episodes(track, places, mark, gaps)]):
         late = np.maximum.accumulate(part) - part
-        turns = np.flatnonzero(np.diff(late > 0, prepend=False, append=False))
-        if len(turns):
-            most = np.maximum.reduceat(np.append(late, 0), turns)[::2]
-            begins, ends = turns[::2], turns[1::2]
-            together = (ends - begins > 1) | camera & (ends == len(part))  # not only overtaken
-            if (together & (most > max(_SET_NS, period / 2))).any() or camera and (
-                    most > max(_BOGUS_NS, 3 * period)).any():
-                return True
+        far = late > max(_SET_NS, period / 2)
+        if (far[1:] & (late[:-1] > 0) | far[:-1] & (late[1:] > 0)).any() or camera and (
+                far[-1:].any() or (late > max(_BOGUS_NS, 3 * period)).any()):
+            return True
     return False
 
 
-def _moved(track: Track) -> np.ndarray:
-    """Return the rows from which on stamps are ahead of log times, or in a pause fall behind."""
-    steps, offset = np.diff(track.stamp), track.stamp - track.log
+def _was_set(frame: Track, mark: Track, gaps: np.ndarray) -> bool:
+    """Tell whether the camera's clock was set forward, or back in a pause, by its log times."""
+    steps, offset = np.diff(frame.stamp), frame.stamp - frame.log
     moves = np.diff(offset)
-    usual = np.flatnonzero((moves < _APART_NS) & (steps > 0))
-    usual = usual[np.argsort(moves[usual])[_FEW:]]
-    passed, logged = steps[usual].sum(), (steps - moves)[usual].sum()
-    if abs(passed - logged) > 0.1 * passed + _APART_NS:  # as in a simulation
-        return usual[:0]
-    found = []
-    for i in (np.flatnonzero(np.abs(moves) > _APART_NS) + 1).tolist():
+    if not len(moves) or np.median(np.abs(moves)) > np.median(steps) / 4:  # as in a simulation
+        return False
+    rows = np.flatnonzero(np.abs(moves) > _APART_NS) + 1
+    for i in rows[~_between_episodes(frame, rows, mark, gaps)].tolist():
         before, after = offset[max(i - _LONG, 0):i], offset[i:i + _LONG]
-        least = _APART_NS if min(len(before), len(after)) > _FEW else _EDGE_NS
-        ahead, behind = after.min() - before.max(), before.min() - after.max()
         paused = steps[i - 1] > max(_PAUSE_NS, 4 * np.median(steps))
-        if ahead > least or paused and (
-                behind > max(least, 2 * np.ptp(before), 2 * np.ptp(after))):
-            found.append(i)
-    return np.array(found, int)
+        if min(len(before), len(after)) >= PROOF and (
+                after.min() - before.max() > _APART_NS or paused and before.min() - after.max() > (
+                    max(_APART_NS, 2 * np.ptp(before), 2 * np.ptp(after)))):
+            return True
+    return False
 
 
-def _anew(track: Track, rows: np.ndarray, mark: Track, gaps: np.ndarray) -> np.ndarray:
+def _between_episodes(track: Track, rows: np.ndarray, mark: Track,
+                      gaps: np.ndarray) -> np.ndarray:
     """
-    Tell before which rows (N,) a clock begins anew as that of a simulation that is reset.
+    Tell before which rows (N,) an episode begins, where a simulation may be reset.
 
-    There the stamps of the marks around jump alike; or marks may be lost.
+    As marks say; or marks may be lost there.
     """
-    if not len(mark) or not len(rows):
+    if not len(mark):
         return np.zeros(len(rows), bool)
-    stamp, log = track.stamp, track.log
     first = np.searchsorted(mark.order, track.order[rows - 1], 'right')
-    last = np.searchsorted(mark.order, track.order[rows]) - 1
-    started = np.maximum(first - 1, 0)
-    between = (last >= first) | (first == 0) | (mark.index[started] != 0) | (
-        np.abs(log[rows] - mark.log[started]) < _OVERTAKEN_NS)
-    between |= ((gaps[:, :1] <= log[rows]) & (gaps[:, 1:] >= log[rows - 1])).any(0)
-    agrees = np.zeros(len(rows), bool)
-    for k in (np.maximum(last, 0), np.minimum(last + 1, len(mark) - 1)):
-        new, old = (np.abs(mark.stamp[k] - np.clip(mark.stamp[k], *np.sort(
-            [stamp[i], stamp[i] + mark.log[k] - log[i]], 0))) for i in (rows, rows - 1))
-        agrees |= (new < _APART_NS) & (new <= old)
-    return between & (agrees if mark.stamp.any() else last >= first)
+    newest = np.maximum(first - 1, 0)
+    return ((mark.order[np.minimum(first, len(mark) - 1)] < track.order[rows]) & (
+        first < len(mark)) | (first == 0) | (mark.index[newest] != 0)
+        | (np.abs(track.log[rows] - mark.log[newest]) < _OVERTAKEN_NS)
+        | ((gaps[:, :1] <= track.log[rows]) & (gaps[:, 1:] >= track.log[rows - 1])).any(0))
 
 
 def _away(track: Track, frame: Track) -> tuple[np.ndarray, np.ndarray]:
