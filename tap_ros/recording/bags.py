@@ -20,7 +20,7 @@ from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number, natural
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.sqlite_file import beginning, SQLITE
-from tap_ros.recording.topic_choice import Bag, list_paths
+from tap_ros.recording.topic_choice import Bag, list_paths, total
 
 VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
 _MOST_FILES = 10000  # of a folder that are looked at
@@ -140,12 +140,8 @@ def list_topics(paths: Paths) -> list[tuple[str, str, int | None]]:
     :return: (topic, type, number of messages, None where unknown), by name.
     :raises RecordingError: when there is no recording, or nothing of a file can be read.
     """
-    found: dict[tuple[str, str], int | None] = {}
-    for bag in find_bags(paths):
-        for one, count in bag.held.items():
-            before = found.get(one, 0)
-            found[one] = None if before is None or count is None else before + count
-    return [(topic, kind, count) for (topic, kind), count in sorted(found.items())]
+    return [(topic, kind, count) for (topic, kind), count in sorted(
+        total(bag.held for bag in find_bags(paths)).items())]
 
 
 def reading_like(training: Mapping[str, Any], paths: Paths, image_topic: str = '',

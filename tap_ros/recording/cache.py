@@ -150,23 +150,20 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     wanted = {folder: (bag, number, choice['topics'])
               for bag, choice, own in zip(bags, choices, folders)
               for number, folder in enumerate(own)}
-    sizes = {folder: bag.files[number].stat().st_size
-             for folder, (bag, number, _) in wanted.items()}
     loaded = {folder: _load(folder, bag.files[number])
               for folder, (bag, number, _) in wanted.items()}
-    with tqdm(total=sum(sizes.values()), desc='decoding once', unit='B', unit_scale=True,
+    works = [Work(str(bag.files[number]), _build, (bag.opened[number], folder, topics, reading))
+             for folder, (bag, number, topics) in wanted.items() if not loaded[folder]]
+    sizes = [os.stat(work.name).st_size for work in works]
+    with tqdm(total=sum(sizes), desc='decoding once', unit='B', unit_scale=True,
               disable=not progress, delay=1) as bar:
-        bar.update(sum(sizes[folder] for folder, part in loaded.items() if part))
-        works = [Work(str(bag.files[number]), _build,
-                      (bag.opened[number], folder, topics, reading))
-                 for folder, (bag, number, topics) in wanted.items() if not loaded[folder]]
-        for work in _built(works, sum(sizes[work.args[1]] for work in works) > _ALONE_BYTES):
+        for work in _built(works, together=sum(sizes) > _ALONE_BYTES):
             folder = work.args[1]
             loaded[folder] = _load(folder, Path(work.name))
             if not loaded[folder]:
                 raise RecordingError(
                     f'{folder}: the cache cannot be read back; is the disk full?')
-            bar.update(sizes[folder])
+            bar.update(sizes[works.index(work)])
     columns = [[part for folder in own if (part := loaded[folder])] for own in folders]
     _check_sizes(list(chain(*columns)))
     # Episodes of the files that follow each other.

@@ -69,10 +69,40 @@ class Columns:
     shapes: dict[str, list[int]] = field(default_factory=dict)  # of pictures, by name
     topics: dict[str, str] = field(default_factory=dict)  # by name
 
+    def logs(self, names: Iterable[str]) -> np.ndarray:
+        """Return the log times of the messages of some names, (N,) int64."""
+        return np.concatenate([np.empty(0, np.int64), *(
+            self.arrays[name][:, 0] for name in names if name in self.arrays)])
+
     def describe(self) -> str:
         """Return all that is not an array as JSON text."""
         return json.dumps({key: value for key, value in vars(self).items()
                            if key not in ('source', 'pictures', 'arrays')})
+
+
+@dataclass
+class Track:
+    """The messages of one name in files that follow each other; N of them."""
+
+    log: np.ndarray  # (N,) int64, ns
+    stamp: np.ndarray  # (N,) int64, ns
+    order: np.ndarray  # (N,) int64: increases as they were written, over all names
+    index: np.ndarray  # (N,) int64, see Columns
+    file: np.ndarray  # (N,) int64, index into the parts
+    first: np.ndarray  # (N,) int64, row of values, the first of several objects
+    values: np.ndarray  # (M, width) float64
+
+    def __len__(self) -> int:
+        return len(self.log)
+
+    def take(self, rows: np.ndarray) -> 'Track':
+        """Return some of the messages."""
+        return Track(self.log[rows], self.stamp[rows], self.order[rows], self.index[rows],
+                     self.file[rows], self.first[rows], self.values)
+
+    def picked(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Return the values of some messages, (N, width)."""
+        return self.values[self.first[rows]]
 
 
 def decode_file(file: McapFile, found: Mapping[str, str],

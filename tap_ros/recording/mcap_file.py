@@ -66,6 +66,7 @@ class McapFile:
 
     :param path: of the file.
     :ivar channels: by number; grows while messages are read.
+    :ivar summary: what the end of the file says that it holds; empty where that is damaged.
     :ivar defects: what could not be used; complete when all messages are read.
     :raises RecordingError: when it is missing, empty, no regular file, or not MCAP.
     """
@@ -84,8 +85,8 @@ class McapFile:
         self._is_read = False  # to the end
         self._needs_summary = True  # as its end says that there is one, or is not there
         self._stopped: int | None = None  # the byte from which on records are not understood
-        self._summary = self._find_summary()
-        self._scan([*self._summary.schemas.values(), *self._summary.channels.values()])
+        self.summary = self._find_summary()
+        self._scan([*self.summary.schemas.values(), *self.summary.channels.values()])
         if not all(known.type_name for known in self.channels.values()):
             self.channels = {}  # the summary has channels without their types
         if not self.channels:
@@ -105,12 +106,14 @@ class McapFile:
         """Let another process go on with what is known."""
         return {name: value for name, value in vars(self).items() if name != '_data'}
 
-    def counts(self) -> Counter[tuple[str, str]]:
-        """Return the number of messages by topic and type; empty where nothing tells it."""
-        found, statistics = Counter[tuple[str, str]](), self._summary.statistics
+    def counts(self) -> dict[tuple[str, str], int | None]:
+        """Return the number of messages by topic and type; None where nothing tells it."""
+        statistics, found = self.summary.statistics, dict[tuple[str, str], int | None]()
         counts = statistics.channel_message_counts if statistics else self._counts
-        for number, channel in self.channels.items() if statistics or self._is_read else ():
-            found[channel.topic, channel.type_name] += counts.get(number, 0)
+        for number, channel in self.channels.items():
+            key = channel.topic, channel.type_name
+            found[key] = (found.get(key) or 0) + counts.get(number, 0) if (
+                statistics or self._is_read) else None
         return found
 
     def messages(self, wanted: Collection[str]) -> Iterator[tuple[Channel, int, int, memoryview]]:
@@ -144,8 +147,8 @@ class McapFile:
     def _blocks(self) -> Iterator[list[Found]]:
         """Yield the messages of the file, block by block."""
         self._counts.clear()
-        if self._summary.chunk_indexes and self.channels:
-            entries = {entry.chunk_start_offset: entry for entry in self._summary.chunk_indexes}
+        if self.summary.chunk_indexes and self.channels:
+            entries = {entry.chunk_start_offset: entry for entry in self.summary.chunk_indexes}
             starts = sorted(entries)
             for start, behind in zip(starts, [*starts[1:], self._size]):
                 yield self._unpacked(start, entries[start], behind)
@@ -269,7 +272,7 @@ class McapFile:
 
     def _conclude(self, wanted: Collection[str]) -> None:
         """Compare what was read with what the end of the file says."""
-        statistics, end = self._summary.statistics, self._newest
+        statistics, end = self.summary.statistics, self._newest
         lines = [
             f'{count - self._counts[number]} of {count} of topic '
             f'{escaped(self.channels[number].topic)}' for number, count in (

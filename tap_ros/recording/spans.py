@@ -14,16 +14,15 @@ end they are left out.
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import warnings
 
 import numpy as np
-from tap_ros.recording.columns import Mark
+from tap_ros.recording.columns import Mark, Track
 from tap_ros.recording.defects import FAR
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.reading import Reading
-from tap_ros.recording.tracks import Track
 
 MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
 _LATE_NS = 5 * 10**9  # likewise where stamps alone tell episodes apart, as no clock begins anew
@@ -45,19 +44,20 @@ class Span:
     outcome: str | None = ''  # None: of frames that may belong to no episode
 
 
-def read_spans(frame: Track, mark: Track, marks: Sequence[Mark], gaps: np.ndarray,
-               reading: Reading, source: str, rounds: np.ndarray) -> list[Span]:
+def read_spans(tracks: Mapping[str, Track], marks: Sequence[Mark], gaps: np.ndarray,
+               rounds: np.ndarray, reading: Reading, source: str) -> list[Span]:
     """
     Read the marks: a list of spans in the order of the log.
 
-    :param frame, mark: sorted by log time.
+    :param tracks: by name, sorted by log time.
     :param marks: (task, seed, outcome) of each mark, by its row of values.
     :param gaps: (G, 2) as defects.gaps.
+    :param rounds: rows of frames that begin a round, see find_rounds.
     :param reading: Reading; without marks, a longer pause than its gap between two frames begins
         an episode; without pauses, longer episodes than it says are cut into equal parts.
     :param source: what warnings call the recording.
-    :param rounds: rows of frames that begin a round, see find_rounds.
     """
+    frame = tracks['frame']
     pauses = frame.stamp[rounds] - frame.stamp[rounds - 1]
     if count := int((pauses <= (reading.gap or np.inf) * 1e9).sum()):
         warnings.warn(
@@ -66,7 +66,7 @@ def read_spans(frame: Track, mark: Track, marks: Sequence[Mark], gaps: np.ndarra
     if not marks and reading.gap:
         _propose_gap(frame.stamp, reading, source)
     places = gaps[np.argsort(gaps[:, 0], kind='stable')].tolist()
-    spans = _marked(mark, marks, places) if marks else _unmarked(
+    spans = _marked(tracks['mark'], marks, places) if marks else _unmarked(
         frame.log, frame.stamp, rounds, int(reading.gap * 1e9), int(reading.episode_seconds * 1e9))
     if places:
         spans = [part for span in spans for part in _cut(span, places)]

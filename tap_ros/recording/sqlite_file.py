@@ -29,7 +29,7 @@ class SqliteFile(McapFile):
         self.channels: dict[int, Channel] = {}
         self.defects: list[Defect] = []
         self._counts = Counter[int]()
-        self._summary, self._is_read = Summary(), True  # the number of messages is known
+        self.summary, self._is_read = Summary(), True  # the number of messages is known
         self._size = os.stat(path).st_size
         try:
             with closing(self._open()) as base:

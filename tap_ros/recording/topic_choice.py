@@ -7,13 +7,13 @@ By what is needed: by type, name and namespace, by the number of messages and, w
 do, by what is in them. Only where two cameras are left is somebody asked.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from tap_ros.base.contract import GRIPPER_JOINTS
@@ -30,6 +30,7 @@ from tap_ros.recording.sqlite_file import open_file
 from tap_ros.robots.arm import find_joints, known_arms
 
 _PACKETS = 'FFMPEGPacket', 'CompressedVideo', 'theora_image_transport/msg/Packet'  # types
+Counts: TypeAlias = dict[tuple[str, str], int | None]  # by topic and type
 _LOOKED_AT = 5  # messages, as the first may be damaged
 _FEW = 20  # of a picture topic are so many times fewer than of a camera
 
@@ -37,6 +38,16 @@ _FEW = 20  # of a picture topic are so many times fewer than of a camera
 def list_paths(paths: Sequence[str | Path]) -> str:
     """Name the first of several files and how many more there are."""
     return str(paths[0]) + (f' and {len(paths) - 1} more' if len(paths) > 1 else '')
+
+
+def total(parts: Iterable[Counts]) -> Counts:
+    """Add up the numbers of messages; what one part does not know nobody does."""
+    found: Counts = {}
+    for part in parts:
+        for key, count in part.items():
+            before = found.get(key, 0)
+            found[key] = None if before is None or count is None else before + count
+    return found
 
 
 @dataclass(frozen=True)
@@ -117,16 +128,9 @@ class Bag:
                      for one in file.channels.values()}.values())
 
     @cached_property
-    def held(self) -> dict[tuple[str, str], int | None]:
+    def held(self) -> Counts:
         """The numbers of messages by topic and type; None where nothing tells it."""
-        counts = [file.counts() for file in self.opened]
-        told = [{(one.topic, one.type_name) for one in file.channels.values()}
-                for file in self.opened]
-        found = {}
-        for key in ((one.topic, one.type_name) for one in self.every):
-            numbers = [count.get(key) for count, keys in zip(counts, told) if key in keys]
-            found[key] = None if None in numbers else sum(filter(None, numbers))
-        return found
+        return total(file.counts() for file in self.opened)
 
     @cached_property
     def channels(self) -> dict[str, Channel]:

@@ -11,14 +11,17 @@ message is kept, each correction gives a warning that names the topic, and right
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import warnings
 
 import numpy as np
 from tap_ros.base.text import escaped
 from tap_ros.messages.stamps import PROOF
-from tap_ros.recording.columns import Columns, Mark, NAMES, WIDTHS
+from tap_ros.recording.columns import Columns, Mark, NAMES, Track, WIDTHS
+from tap_ros.recording.defects import FAR
 from tap_ros.recording.episode import RecordingWarning
+from tap_ros.recording.reading import Reading
+from tap_ros.recording.spans import find_rounds, read_spans, Span
 
 _APART_NS = 7 * 10**8  # late messages and slow cameras explain no larger difference of two clocks
 _BEHIND_NS = 35 * 10**7  # only a camera is late; what else is behind it has another clock
@@ -28,35 +31,39 @@ _BOGUS_NS = 5 * 10**8  # a single time is wrong by more
 _PAUSE_NS = 5 * 10**8  # of a camera, in which its clock may be set back unseen
 _OVERTAKEN_NS = 10**8  # a frame may be logged so long before the mark that precedes it
 _LONG = 30  # messages beside a place that tell what it is
-_MANY = 10  # messages of one stamp, of which no driver sends so many together
 _SMOOTH = 9  # messages that tell how far two clocks are apart
 _STREAMS = ('frame', 'twist', 'joint', 'arm', 'object')
-_OF_ANOTHER = 'are of another clock than the camera, which is ahead or behind'
 
 
-@dataclass
-class Track:
-    """The messages of one name in files that follow each other; N of them."""
+def read_tracks(parts: Sequence[Columns], reading: Reading) -> tuple[
+        dict[str, Track], list[tuple[str, ...]], np.ndarray, list[Span]]:
+    """
+    Join files that follow each other, correct their times, and find the episodes.
 
-    log: np.ndarray  # (N,) int64, ns
-    stamp: np.ndarray  # (N,) int64, ns
-    order: np.ndarray  # (N,) int64: increases as they were written, over all names
-    index: np.ndarray  # (N,) int64, see Columns
-    file: np.ndarray  # (N,) int64, index into the parts
-    first: np.ndarray  # (N,) int64, row of values, the first of several objects
-    values: np.ndarray  # (M, width) float64
+    :param parts: list of Columns, in playing order.
+    :param reading: Reading; it says where episodes are cut that no marks tell apart.
+    :return: Tracks by name, sorted by log time; names of objects by number; gaps (G, 2) as
+        defects.gaps; spans of the episodes.
+    """
+    tracks, names, marks = join(parts)
+    gaps, twist, frame = _gaps(parts), tracks['twist'], tracks['frame']
+    if twist.stamp.any():  # zero twists without a stamp say stop, and answer no frame
+        tracks['twist'] = twist.take(np.flatnonzero((twist.stamp != 0) | twist.picked().any(1)))
+    rounds = () if marks else frame.order[find_rounds(frame.stamp, frame.picked()[:, 0])]
+    tracks = correct_times(tracks, parts[0], gaps)
+    return tracks, names, gaps, read_spans(
+        tracks, marks, gaps, np.flatnonzero(np.isin(tracks['frame'].order, rounds)), reading,
+        parts[0].source)
 
-    def __len__(self) -> int:
-        return len(self.log)
 
-    def take(self, rows: np.ndarray) -> 'Track':
-        """Return some of the messages."""
-        return Track(self.log[rows], self.stamp[rows], self.order[rows], self.index[rows],
-                     self.file[rows], self.first[rows], self.values)
-
-    def picked(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Return the values of some messages, (N, width)."""
-        return self.values[self.first[rows]]
+def _gaps(parts: Sequence[Columns]) -> np.ndarray:
+    """Return the gaps of all files, (G, 2); one without a place is behind what came before."""
+    gaps, newest = [np.empty((0, 2), np.int64)], -FAR
+    for part in parts:
+        own = part.arrays.get('gap', gaps[0])
+        gaps.append(np.where(own[:, :1] <= -FAR, newest, own))
+        newest = int(part.logs(NAMES).max(initial=newest))
+    return np.concatenate(gaps)
 
 
 def join(parts: Sequence[Columns]) -> tuple[dict[str, Track], list[tuple[str, ...]], list[Mark]]:
@@ -94,35 +101,31 @@ def correct_times(tracks: Mapping[str, Track], part: Columns,
     :param gaps: (G, 2) as defects.gaps: where marks may be lost.
     """
     said: list[str] = []
-    called = {name: f'topic {escaped(part.topics.get(name, name))}' for name in tracks}
-    called['arm'] = called['joint']
     tracks = _one_log(dict(tracks), said)
     frame, mark = _without_resent(tracks['frame']), tracks['mark']
     tracks['frame'] = frame
     same = np.count_nonzero(np.diff(frame.stamp) == 0)
     if not frame.stamp.any():
         tracks |= _all_by_log(tracks)
-    elif same or _goes_back(frame, mark, gaps, True) or _was_set(frame, mark, gaps):
+    elif same or _goes_back(frame, mark, gaps) or _was_set(frame, mark, gaps):
         if not said:  # else it is the same cause
             said.append(
-                f'{called["frame"]}: of {len(frame)} stamps {same} are repeated, '
-                f'{np.count_nonzero(frame.stamp == 0)} are zero and '
+                f'topic {escaped(part.topics.get("frame"))}: of {len(frame)} stamps {same} are '
+                f'repeated, {np.count_nonzero(frame.stamp == 0)} are zero and '
                 f'{np.count_nonzero(np.diff(frame.stamp) < 0)} go back, or its clock was set; log '
                 'times take their place, for all topics')
         tracks |= _all_by_log(tracks)
     else:
-        found = {name: _comparable(name, tracks, gaps) for name in (*_STREAMS[1:], 'mark')
-                 if len(tracks[name])}
-        for name, (track, why) in found.items():
-            tracks[name] = track
-            if why:
-                said.append(f'{called[name]}: its {len(track)} stamps {why}; log times take their '
+        for name in ('twist', 'joint', 'arm', 'object', 'mark'):
+            tracks[name], is_apart = _comparable(name, tracks[name], frame)
+            if is_apart:
+                topic = part.topics.get('joint' if name == 'arm' else name)
+                said.append(f'topic {escaped(topic)}: its {len(tracks[name])} stamps are of '
+                            'another clock than the camera, or stand still; log times take their '
                             'place')
-        if found and all(why for _, why in found.values()):  # the camera's clock is the odd one
-            ahead = int(np.median(frame.stamp - frame.log))
-            for name in ('goal', 'goal_mask', 'goal_object'):
-                stamp = tracks[name].stamp
-                tracks[name] = replace(tracks[name], stamp=stamp + ahead * (stamp != 0))
+            if is_apart and name == 'mark':  # with which these would be compared
+                tracks |= {goal: replace(tracks[goal], stamp=0 * tracks[goal].stamp)
+                           for goal in ('goal', 'goal_mask', 'goal_object')}
     for text in dict.fromkeys(said):
         warnings.warn(f'{escaped(part.source)}: {text}', RecordingWarning, stacklevel=3)
     return {name: _sorted(track) for name, track in tracks.items()}
@@ -145,9 +148,8 @@ def _one_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
                       for key, track in tracks.items()}
     if found:
         most = max(found, key=abs)
-        often = f'{len(found)} times, by up to' if len(found) > 1 else 'by'
-        said.append(f'the clock of the recorder was set {"back" if most < 0 else "forward"} '
-                    f'{often} {abs(most) / 1e9:.1f} s; messages go on in the order in which they '
+        said.append(f'the clock of the recorder was set {"back" if most < 0 else "forward"}, by '
+                    f'up to {abs(most) / 1e9:.1f} s; messages go on in the order in which they '
                     'were written')
     return tracks
 
@@ -190,48 +192,33 @@ def _restamped(track: Track, before: Track, after: Track) -> Track:
         before.stamp[newest] == track.stamp, after.stamp[newest], track.log))
 
 
-def _comparable(name: str, tracks: dict[str, Track], gaps: np.ndarray) -> tuple[Track, str]:
-    """Return what has stamps that can be compared with those of frames, and what was wrong."""
-    track, frame = tracks[name], tracks['frame']
+def _comparable(name: str, track: Track, frame: Track) -> tuple[Track, bool]:
+    """Return what has stamps that can be compared with those of frames; whether it had others."""
+    if not len(track):
+        return track, False
     shown, zero = _sorted(frame), track.stamp == 0
     newest = np.maximum(np.searchsorted(shown.log, track.log, 'right') - 1, 0)
     by_log = track.log + (shown.stamp - shown.log)[newest]
     if name == 'mark':
-        off = ~zero & (np.abs(_away(track, frame)[0]) > _APART_NS)
-        return (replace(track, stamp=by_log * ~zero), _OF_ANOTHER) if off.any() else (track, '')
-    repeats = _repeats(track, name)
+        is_apart = bool((~zero & (np.abs(_away(track, frame)[0]) > _APART_NS)).any())
+        return replace(track, stamp=by_log * ~zero) if is_apart else track, is_apart
     if zero.any():  # a command answers a frame
         track = replace(track, stamp=np.where(
             zero, by_log if name in ('joint', 'arm') else shown.stamp[newest], track.stamp))
-    why = 'are repeated' if repeats else (
-        'go back' if _goes_back(track, tracks['mark'], gaps, False) else
-        _OF_ANOTHER if _is_apart(track, frame) else '')
-    return replace(track, stamp=by_log) if why else track, why
+    is_apart = _is_apart(track, frame)
+    return replace(track, stamp=by_log) if is_apart else track, is_apart
 
 
-def _repeats(track: Track, name: str) -> bool:
-    """Tell whether stamps stand still while values change."""
-    if name == 'object' or len(track) <= PROOF:
-        return False
-    values = track.picked()
-    same = (np.diff(track.stamp) == 0) & (track.stamp[1:] != 0)
-    differ = same & ~np.isclose(values[1:], values[:-1], equal_nan=True).all(1)
-    counts = np.bincount(np.cumsum(~same), differ)  # how often values change within one stamp
-    return bool(differ.mean() > 0.5 or counts.max() > _MANY)
-
-
-def _goes_back(track: Track, mark: Track, gaps: np.ndarray, camera: bool) -> bool:
+def _goes_back(frame: Track, mark: Track, gaps: np.ndarray) -> bool:
     """Tell whether stamps go back, other than where an episode begins, or one was overtaken."""
-    steps = np.diff(track.stamp)
+    steps = np.diff(frame.stamp)
     places = np.flatnonzero(steps < 0) + 1
-    if not len(places):
-        return False
-    period = float(np.median(steps))
-    for part in np.split(track.stamp, places[_between_episodes(track, places, mark, gaps)]):
+    period = float(np.median(steps)) if len(places) else 0
+    for part in np.split(frame.stamp, places[_between_episodes(frame, places, mark, gaps)]):
         late = np.maximum.accumulate(part) - part
         far = late > max(_SET_NS, period / 2)
-        if (far[1:] & (late[:-1] > 0) | far[:-1] & (late[1:] > 0)).any() or camera and (
-                far[-1:].any() or (late > max(_BOGUS_NS, 3 * period)).any()):
+        several = (far[1:] & (late[:-1] > 0)) | (far[:-1] & (late[1:] > 0))
+        if several.any() or far[-1:].any() or (late > max(_BOGUS_NS, 3 * period)).any():
             return True
     return False
 
@@ -291,7 +278,6 @@ def _is_apart(track: Track, frame: Track) -> bool:
     apart, inside = _away(track, frame)
     if len(inside) <= PROOF or np.isin(track.stamp[inside], frame.stamp).mean() > 0.5:
         return False  # what repeats stamps of frames is of the camera's clock, however late
-    base = apart[inside]
     smooth = np.median(np.lib.stride_tricks.sliding_window_view(
-        base, min(_SMOOTH, len(base))), 1)
+        apart[inside], min(_SMOOTH, len(inside))), 1)
     return bool(((smooth > _APART_NS) | (smooth < -_BEHIND_NS)).any())

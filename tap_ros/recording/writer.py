@@ -10,18 +10,14 @@ gives equal bytes: no clock is read into the file.
 from contextlib import suppress
 import os
 from pathlib import Path
-import struct
 from typing import Any, Self
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.files import storage_errors
-from tap_ros.base.text import escaped
 from tap_ros.messages import topics
 from tap_ros.messages.images import camera_info_fields, image_fields, mask_fields
 from tap_ros.messages.joints import joint_fields
@@ -29,6 +25,7 @@ from tap_ros.messages.objects import objects_fields
 from tap_ros.messages.stamps import header_fields, stamp_fields
 from tap_ros.recording import metadata
 from tap_ros.recording.episode import check_episode, Episode
+from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.messages import encode, schema_text, type_hash, typestore
 
 EPISODE_GAP_NS = 10**9  # between episodes whose stamps do not follow each other
@@ -319,23 +316,12 @@ def count_episodes(path: Path) -> int:
 
 def _describe(path: Path) -> dict[str, Any]:
     """Describe a finished file as FileWriter.close does."""
-    try:
-        with open(path, 'rb') as stream:
-            summary = make_reader(stream).get_summary()
-    except (OSError, McapError, ValueError, LookupError, ArithmeticError, MemoryError,
-            struct.error) as error:
-        raise RecordingError(
-            f'{path}: not a finished MCAP file: {escaped(error)}') from error
-    if summary is None or summary.statistics is None:
+    file = McapFile(path)
+    if not (statistics := file.summary.statistics):
         raise RecordingError(f'{path}: not a finished MCAP file: it has no summary')
-    counts = summary.statistics.channel_message_counts
-    found = {}
-    for channel in summary.channels.values():
-        kind = summary.schemas[channel.schema_id].name
-        found[channel.topic] = {
-            'type': kind, 'qos': [topics.default_qos(channel.topic).profile()],
-            'type_hash': type_hash(kind), 'count': counts.get(channel.id, 0)}
     return {
-        'path': path.name, 'start': summary.statistics.message_start_time,
-        'end': summary.statistics.message_end_time,
-        'message_count': summary.statistics.message_count, 'topics': found}
+        'path': path.name, 'start': statistics.message_start_time,
+        'end': statistics.message_end_time, 'message_count': statistics.message_count,
+        'topics': {topic: {'type': kind, 'qos': [topics.default_qos(topic).profile()],
+                           'type_hash': type_hash(kind), 'count': count}
+                   for (topic, kind), count in file.counts().items()}}

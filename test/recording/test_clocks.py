@@ -138,7 +138,7 @@ DEFECTS = {  # how, and what the warnings name
     'logs back': (set_clock(ALL, -1, logs=True, stamps=False), 'recorder.* back'),
     'logs forward': (set_clock(ALL, 1, logs=True, stamps=False), None),
     'stamps back': (set_clock(ALL, -1), '/cam'),
-    'joints back': (set_clock(['joint'], -1), '/joint_states'),
+    'joints back': (set_clock(['joint'], -1, least=1), '/joint_states'),
     'joints forward': (set_clock(['joint'], 1, least=1), '/joint_states'),
     'commands back': (set_clock(['twist'], -1, least=1), '/cmd'),
     'commands of another computer': (off('twist'), '/cmd'),
@@ -154,7 +154,7 @@ DEFECTS = {  # how, and what the warnings name
     'whole seconds': (stamped('frame', lambda s, _: s // SECOND * SECOND), '/cam.*repeated'),
     'joints of whole seconds': (
         stamped('joint', lambda s, _: s // SECOND * SECOND), '/joint_states'),
-    'joints stand from the middle': (stamped('joint', half), '/joint_states.*repeated'),
+    'joints stand from the middle': (stamped('joint', half), '/joint_states'),
     'camera waits to be written': (camera_waits, None),
     'joints without': (stamped('joint', lambda s, _: 0 * s), None)}
 DEFECTS |= {
