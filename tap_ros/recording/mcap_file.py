@@ -87,20 +87,19 @@ class McapFile:
         self._stopped: int | None = None  # the byte from which on records are not understood
         self.summary = self._find_summary()
         self._scan([*self.summary.schemas.values(), *self.summary.channels.values()])
-        if not all(known.type_name for known in self.channels.values()):
-            self.channels = {}  # the summary has channels without their types
-        if not self.channels:
+        if not self.channels or not all(one.type_name for one in self.channels.values()):
+            self.channels, self.summary.chunk_indexes = {}, []  # the summary does not tell types
             for _ in self.messages(()):
                 pass
+        self.close()
 
     @cached_property
     def _data(self) -> bytes | mmap.mmap:
         return bytes_of(self.path)
 
     def close(self) -> None:
-        """Free what was unpacked; what is read next unpacks it again."""
-        if isinstance(vars(self).get('_data'), bytes):
-            del self._data
+        """Let go of the bytes, of which there may be many; what is read next maps them again."""
+        vars(self).pop('_data', None)
 
     def __getstate__(self) -> dict[str, Any]:
         """Let another process go on with what is known."""
@@ -147,7 +146,7 @@ class McapFile:
     def _blocks(self) -> Iterator[list[Found]]:
         """Yield the messages of the file, block by block."""
         self._counts.clear()
-        if self.summary.chunk_indexes and self.channels:
+        if self.summary.chunk_indexes:
             entries = {entry.chunk_start_offset: entry for entry in self.summary.chunk_indexes}
             starts = sorted(entries)
             for start, behind in zip(starts, [*starts[1:], self._size]):
@@ -214,11 +213,7 @@ class McapFile:
                 _unpack(name, self._data[start + stream.count:], size), self._budget)
 
     def _unpacked(self, start: int, chunk: Chunk | ChunkIndex, behind: int = 0) -> list[Found]:
-        """
-        Return the messages of a chunk, or of what the summary says of one, at a byte.
-
-        :param behind: where the summary says that the next one begins.
-        """
+        """Return the messages of a chunk at a byte; its summary says where the next begins."""
         first, last = (min(time, FAR) for time in (
             chunk.message_start_time, chunk.message_end_time))
         try:
