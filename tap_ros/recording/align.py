@@ -198,12 +198,10 @@ def _actions(tracks: dict[str, Track], clock: _Clock) -> np.ndarray:
     step = np.searchsorted(clock.times, times, 'right') - 1
     with np.errstate(over='ignore'):  # absurd numbers become infinite
         actions[step[step >= 0], :3] = twist.picked(rows[step >= 0])
-        by_log = np.argsort(logs, kind='stable')
         if len(command) and len(logs):
-            step = np.searchsorted(logs[by_log], command.log, 'right') - 1
-            newest = np.full(len(logs), -1)
-            newest[by_log[step[step >= 0]]] = np.flatnonzero(step >= 0)
-            newest = np.maximum.accumulate(newest)
+            by_log = np.argsort(logs, kind='stable')
+            newest = np.empty(len(logs), np.int64)
+            newest[by_log] = np.searchsorted(command.log, np.append(logs[by_log[1:]], FAR)) - 1
             earliest = np.searchsorted(command.log, logs[clock.starts[:-1]])
             known = newest >= earliest[clock.owner]
             actions[known, 3] = command.picked(newest[known])[:, 0]

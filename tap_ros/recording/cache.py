@@ -40,7 +40,7 @@ from tap_ros.recording.episode import Episode, EpisodeTable, RecordingWarning
 from tap_ros.recording.mcap_file import bytes_of, McapFile
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
-from tap_ros.recording.topic_choice import list_paths
+from tap_ros.recording.topic_choice import Bag, list_paths
 from tqdm import tqdm
 
 FORMAT = 9  # of a cache folder; another number makes all files be decoded again
@@ -140,31 +140,17 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
         for bag, camera in zip(bags, cameras)]
     for bag, choice in zip(bags, choices):
         for doubt in choice['doubts']:
-            warnings.warn(f'{escaped(bag.source)}: {doubt}', RecordingWarning, stacklevel=2)
+            warnings.warn(f'{bag.source}: {doubt}', RecordingWarning, stacklevel=2)
     if network:
         _check_first_sizes({tuple(choice['size']) for choice in choices if choice['size']},
                            reading, network)
     # What each file holds: from the cache, or decoded into it.
     folders = [[_folder(cache, digests[path], choice['topics'], reading) for path in bag.files]
                for bag, choice in zip(bags, choices)]
-    wanted = {folder: (bag, number, choice['topics'])
-              for bag, choice, own in zip(bags, choices, folders)
-              for number, folder in enumerate(own)}
-    loaded = {folder: _load(folder, bag.files[number])
-              for folder, (bag, number, _) in wanted.items()}
-    works = [Work(str(bag.files[number]), _build, (bag.opened[number], folder, topics, reading))
-             for folder, (bag, number, topics) in wanted.items() if not loaded[folder]]
-    sizes = [os.stat(work.name).st_size for work in works]
-    with tqdm(total=sum(sizes), desc='decoding once', unit='B', unit_scale=True,
-              disable=not progress, delay=1) as bar:
-        for work in _built(works, together=sum(sizes) > _ALONE_BYTES):
-            folder = work.args[1]
-            loaded[folder] = _load(folder, Path(work.name))
-            if not loaded[folder]:
-                raise RecordingError(
-                    f'{folder}: the cache cannot be read back; is the disk full?')
-            bar.update(sizes[works.index(work)])
-    columns = [[part for folder in own if (part := loaded[folder])] for own in folders]
+    loaded = _loaded({folder: (bag, number, choice['topics'])
+                      for bag, choice, own in zip(bags, choices, folders)
+                      for number, folder in enumerate(own)}, reading, progress)
+    columns = [[loaded[folder] for folder in own] for own in folders]
     _check_sizes(list(chain(*columns)))
     # Episodes of the files that follow each other.
     arms = [read_mount(bag.files[0].parent) for bag in bags]
@@ -261,6 +247,26 @@ def _folder(cache: Path, digest: str, topics: dict[str, str], reading: Reading) 
     """Return the folder for a file that is read in one way."""
     key = json.dumps([FORMAT, sorted(topics.items()), reading.crop, reading.size, reading.rate])
     return cache / f'{digest}-{hashlib.sha256(key.encode()).hexdigest()[:8]}'
+
+
+def _loaded(wanted: dict[Path, tuple[Bag, int, dict[str, str]]], reading: Reading,
+            progress: bool) -> dict[Path, Columns]:
+    """Return what files of bags hold, by their folder of the cache, decoding what is not there."""
+    found = {folder: _load(folder, bag.files[number])
+             for folder, (bag, number, _) in wanted.items()}
+    works = [Work(str(bag.files[number]), _build, (bag.opened[number], folder, topics, reading))
+             for folder, (bag, number, topics) in wanted.items() if not found[folder]]
+    sizes = [os.stat(work.name).st_size for work in works]
+    with tqdm(total=sum(sizes), desc='decoding once', unit='B', unit_scale=True,
+              disable=not progress, delay=1) as bar:
+        for work in _built(works, together=sum(sizes) > _ALONE_BYTES):
+            folder = work.args[1]
+            found[folder] = _load(folder, Path(work.name))
+            if not found[folder]:
+                raise RecordingError(
+                    f'{folder}: the cache cannot be read back; is the disk full?')
+            bar.update(sizes[works.index(work)])
+    return {folder: part for folder, part in found.items() if part}
 
 
 def _built(works: Sequence[Work], together: bool) -> Iterator[Work]:

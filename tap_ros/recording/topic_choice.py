@@ -226,8 +226,8 @@ class Bag:
             if len(places) < 2:
                 return found
         doubts.append(
-            f'{self.source}: several topics could be {one.recorded}: {self.listing(found)}; none '
-            'is read, as none is in the namespace of the camera')
+            f'several topics could be {one.recorded}: {self.listing(found)}; none is read, as '
+            'none is in the namespace of the camera')
         return []
 
     def picture(self, topic: str) -> np.ndarray | str:

@@ -267,19 +267,16 @@ class EpisodeWriter:
 
     def _goal(self, episode: Episode, stamp: int) -> None:
         """Write the goal; an empty one takes back that of the episode before."""
-        for topic, fields, picture in (
-                (topics.GOAL_IMAGE, image_fields, episode.goal_frame),
-                (topics.GOAL_ROBOT_MASK, mask_fields, episode.goal_mask)):
-            if picture is not None or topic in self._goals:
-                self._put(topic, stamp, fields(picture, stamp, CAMERA_FRAME))
-            (self._goals.discard if picture is None else self._goals.add)(topic)
-        if episode.object_names or topics.GOAL_OBJECTS in self._goals:
-            self._put(topics.GOAL_OBJECTS, stamp, objects_fields(
-                episode.object_names, episode.goal_pixels, episode.goal_poses, stamp,
-                WORLD_FRAME, episode.object_source))
-            self._goals.add(topics.GOAL_OBJECTS)
-            if not episode.object_names:
-                self._goals.discard(topics.GOAL_OBJECTS)
+        at = stamp, CAMERA_FRAME
+        for topic, goal, fields in (
+                (topics.GOAL_IMAGE, episode.goal_frame, image_fields(episode.goal_frame, *at)),
+                (topics.GOAL_ROBOT_MASK, episode.goal_mask, mask_fields(episode.goal_mask, *at)),
+                (topics.GOAL_OBJECTS, episode.object_names or None, objects_fields(
+                    episode.object_names, episode.goal_pixels, episode.goal_poses, stamp,
+                    WORLD_FRAME, episode.object_source))):
+            if goal is not None or topic in self._goals:
+                self._put(topic, stamp, fields)
+            (self._goals.discard if goal is None else self._goals.add)(topic)
 
     def _mark(self, episode: Episode, stamp: int, event: int) -> None:
         self._put(topics.EPISODE, stamp, {
