@@ -123,20 +123,13 @@ def _marked(mark: Track, marks: Sequence[Mark], gaps: list[list[int]]) -> list[S
     return spans
 
 
-def find_rounds(stamps: np.ndarray, checksums: np.ndarray) -> np.ndarray:
+def find_rounds(checksums: np.ndarray) -> np.ndarray:
     """
     Find where a playback that was recorded began anew.
 
-    :param stamps, checksums: (N,) of the pictures, in the order in which they were written.
+    :param checksums: (N,) of the pictures, in the order in which they were written.
     :return: rows from which on pictures are as before, in their order: (R,) int64.
     """
-    count = len(np.unique(checksums))
-    if len(checksums) - count < _ROUND:
-        return np.empty(0, np.int64)
-    back = np.flatnonzero(np.diff(stamps) < -MAX_JITTER_NS) + 1
-    pairs = np.unique(np.stack([stamps, checksums], 1), axis=0)
-    if len(back) and len(pairs) <= len(stamps) - _ROUND:  # the same pictures with their stamps
-        return back
     places: dict[float, int] = {}  # in its round, by checksum
     at, known, place = [], [], -1
     for checksum in checksums.tolist():

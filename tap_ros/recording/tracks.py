@@ -49,7 +49,7 @@ def read_tracks(parts: Sequence[Columns], reading: Reading) -> tuple[
     gaps, twist, frame = _gaps(parts), tracks['twist'], tracks['frame']
     if twist.stamp.any():  # zero twists without a stamp say stop, and answer no frame
         tracks['twist'] = twist.take(np.flatnonzero((twist.stamp != 0) | twist.picked().any(1)))
-    rounds = () if marks else frame.order[find_rounds(frame.stamp, frame.picked()[:, 0])]
+    rounds = () if marks else frame.order[find_rounds(frame.picked()[:, 0])]
     tracks = correct_times(tracks, parts[0], gaps)
     return tracks, names, gaps, read_spans(
         tracks, marks, gaps, np.flatnonzero(np.isin(tracks['frame'].order, rounds)), reading,
