@@ -90,12 +90,12 @@ class Bag:
                         for file in self.opened if file.defects and not any(
                             file.counts().values())), f'{self.source}: holds no message')
             raise RecordingError(why)
-        camera, doubts = self.camera(image_topic), list[str]()
+        camera, doubts = self._camera(image_topic), list[str]()
         topics = {camera: IMAGE.becomes} | {
             topic: name for name, one in BY_COLUMNS.items() if one is not IMAGE
-            for topic in self.beside(one, camera, doubts)}
-        for channel in self.every:
-            if channel.topic not in topics or channel.type_name not in self.types(channel.topic):
+            for topic in self._beside(one, camera, doubts)}
+        for channel in self._every:
+            if channel.topic not in topics or channel.type_name not in self._types(channel.topic):
                 continue
             source = f'{self.source}: topic {escaped(channel.topic)}'
             if channel.encoding != 'cdr':
@@ -122,7 +122,7 @@ class Bag:
         return list(map(open_file, self.files))
 
     @cached_property
-    def every(self) -> list[Channel]:
+    def _every(self) -> list[Channel]:
         """The channels, one a topic and type."""
         return list({(one.topic, one.type_name): one for file in self.opened
                      for one in file.channels.values()}.values())
@@ -136,21 +136,21 @@ class Bag:
     def channels(self) -> dict[str, Channel]:
         """A channel by topic; of several types the one that fits the name."""
         found: dict[str, Channel] = {}
-        for one in self.every:
+        for one in self._every:
             if one.topic not in found or one.type_name in (_named_best(one.topic) or IMAGE).types:
                 found[one.topic] = one
         return found
 
     @cached_property
-    def counts(self) -> dict[str, int]:
+    def _counts(self) -> dict[str, int]:
         """The numbers of messages of the types that are read, by topic, as far as known."""
         found: dict[str, int] = {}
         for (topic, kind), count in self.held.items():
-            if kind in self.types(topic) and count is not None:
+            if kind in self._types(topic) and count is not None:
                 found[topic] = found.get(topic, 0) + count
         return found
 
-    def camera(self, wanted: str) -> str:
+    def _camera(self, wanted: str) -> str:
         """Return the camera's topic."""
         pictures = [topic for topic, channel in self.channels.items()
                     if channel.type_name in IMAGE.types]
@@ -159,23 +159,23 @@ class Bag:
                 wanted = f'{wanted}/compressed'
             if wanted not in pictures:
                 raise RecordingError(f'{self.source}: no topic {escaped(wanted)} of type '
-                                     f'{" or ".join(IMAGE.types)}; {self.known}')
-            if self.counts.get(wanted) == 0:
+                                     f'{" or ".join(IMAGE.types)}; {self._known}')
+            if self._counts.get(wanted) == 0:
                 raise RecordingError(f'{self.source}: topic {escaped(wanted)} holds no message; '
-                                     f'{self.known}')
+                                     f'{self._known}')
             return wanted
-        left = [topic for topic in pictures if self.counts.get(topic) != 0
+        left = [topic for topic in pictures if self._counts.get(topic) != 0
                 and _named_best(topic) in (None, IMAGE)] or [
                 topic for topic in pictures if _named_best(topic) is IMAGE]
-        most = max((self.counts.get(topic, 0) for topic in left), default=0)
+        most = max((self._counts.get(topic, 0) for topic in left), default=0)
         rules: tuple[Callable[[str], object], ...] = (
-            self.is_main_one,
-            lambda topic: _named_best(topic) is IMAGE and self.is_usable(topic),
-            lambda topic: self.counts.get(topic, most) * _FEW > most,
-            lambda topic: self.is_usable(topic),
+            self._is_main_one,
+            lambda topic: _named_best(topic) is IMAGE and self._is_usable(topic),
+            lambda topic: self._counts.get(topic, most) * _FEW > most,
+            lambda topic: self._is_usable(topic),
             # Of a camera that is there raw, too, nothing more is learned from compressed pictures.
             lambda topic: _plain(topic) == topic or _plain(topic) not in left,
-            self.is_coloured)
+            self._is_coloured)
         for rule in rules:
             if len(left) > 1:
                 left = [topic for topic in left if rule(topic)] or left
@@ -183,42 +183,42 @@ class Bag:
             why = _explain(self.channels.values())
             raise RecordingError(f'{self.source}: ' + (why or (
                 f'no topic ends in {IMAGE.recorded} with type {IMAGE.type}; name the camera topic '
-                '(--image-topic) if it is called otherwise')) + f'; {self.known}')
-        if len(left) > 1 and not any(map(self.is_usable, left)):
-            why = '; '.join(f'{escaped(topic)}: {self.picture(topic)}' for topic in left[:3])
+                '(--image-topic) if it is called otherwise')) + f'; {self._known}')
+        if len(left) > 1 and not any(map(self._is_usable, left)):
+            why = '; '.join(f'{escaped(topic)}: {self._picture(topic)}' for topic in left[:3])
             raise RecordingError(f'{self.source}: none of its topics of pictures can be used: '
-                                 f'{self.listing(left)}; {why}')
+                                 f'{self._listing(left)}; {why}')
         if len(left) > 1:
             raise RecordingError(
-                f'{self.source}: several topics could be {IMAGE.recorded}: {self.listing(left)}; '
+                f'{self.source}: several topics could be {IMAGE.recorded}: {self._listing(left)}; '
                 'name the camera topic (--image-topic)')
         return left[0]
 
-    def types(self, topic: str) -> tuple[str, ...]:
+    def _types(self, topic: str) -> tuple[str, ...]:
         """Return the types of a topic's messages that are read."""
         kind = self.channels[topic].type_name
         return IMAGE.types if kind in IMAGE.types else (kind,)
 
-    def is_main_one(self, topic: str) -> bool:
+    def _is_main_one(self, topic: str) -> bool:
         """Tell whether its other topic, raw or compressed, has less than twice its pictures."""
         raw = _plain(topic)
         other = raw if raw != topic else f'{topic}/compressed'
-        return not (0 < 2 * self.counts.get(topic, 0) <= self.counts.get(other, 0)
+        return not (0 < 2 * self._counts.get(topic, 0) <= self._counts.get(other, 0)
                     and self.channels[other].type_name in IMAGE.types
-                    and self.is_usable(other))
+                    and self._is_usable(other))
 
-    def beside(self, one: Topic, camera: str, doubts: list[str]) -> list[str]:
+    def _beside(self, one: Topic, camera: str, doubts: list[str]) -> list[str]:
         """Return the topics that are read as one of ours, beside a camera."""
         found = [topic for topic, channel in self.channels.items()
                  if channel.type_name in one.types and _named_best(topic) is one
-                 and self.counts.get(topic) != 0]
+                 and self._counts.get(topic) != 0]
         found = [topic for topic in found if _plain(topic) == topic or _plain(topic) not in found]
         above = [topic for topic in found
                  if camera.startswith(_plain(topic).removesuffix(one.name))]
         if above or len(found) < 2:
             return sorted(above, key=len)[-1:] or found
         if one is JOINT_STATES:
-            told = {topic: next(map(decode_positions, self.first(topic)), {}) for topic in found}
+            told = {topic: next(map(decode_positions, self._first(topic)), {}) for topic in found}
             places = [topic for topic, names in told.items()
                       if find_joints(names, known_arms()) or names.keys() & set(PLACE)]
             found = [topic for topic in found if topic in places
@@ -226,44 +226,44 @@ class Bag:
             if len(places) < 2:
                 return found
         doubts.append(
-            f'several topics could be {one.recorded}: {self.listing(found)}; none is read, as '
+            f'several topics could be {one.recorded}: {self._listing(found)}; none is read, as '
             'none is in the namespace of the camera')
         return []
 
-    def picture(self, topic: str) -> np.ndarray | str:
+    def _picture(self, topic: str) -> np.ndarray | str:
         """Return one of the first pictures of a topic, or why none of them can be used."""
         why = 'damaged'
-        for message in self.first(topic):
+        for message in self._first(topic):
             try:
                 return decode_image(message)
             except ImageError as error:
                 why = str(error)
         return why
 
-    def is_usable(self, topic: str) -> bool:
+    def _is_usable(self, topic: str) -> bool:
         """Tell whether one of the first pictures of a topic can be used."""
-        return isinstance(self.picture(topic), np.ndarray)
+        return isinstance(self._picture(topic), np.ndarray)
 
-    def is_coloured(self, topic: str) -> bool:
+    def _is_coloured(self, topic: str) -> bool:
         """Tell whether one of the first pictures of a topic has colours."""
-        picture = self.picture(topic)
+        picture = self._picture(topic)
         return isinstance(picture, np.ndarray) and bool(np.ptp(picture, -1).any())
 
-    def listing(self, topics: Sequence[str]) -> str:
+    def _listing(self, topics: Sequence[str]) -> str:
         """List topics with the number of their messages."""
-        return listing((f'{topic} ({self.counts.get(topic, "?")} messages)'
+        return listing((f'{topic} ({self._counts.get(topic, "?")} messages)'
                         for topic in sorted(topics)), 20)
 
     @cached_property
-    def known(self) -> str:
+    def _known(self) -> str:
         """All topics, in words."""
         return 'topics found: ' + (listing((
-            f'{topic} ({channel.type_name}, {self.counts.get(topic, "?")} messages)'
+            f'{topic} ({channel.type_name}, {self._counts.get(topic, "?")} messages)'
             for topic, channel in sorted(self.channels.items())), 20) or 'none')
 
-    def first(self, topic: str) -> list[Any]:
+    def _first(self, topic: str) -> list[Any]:
         """Return the first messages of a topic that can be decoded."""
-        found, types = [], self.types(topic)
+        found, types = [], self._types(topic)
         for file in self.opened:
             fitting = (one for one in file.messages({topic}) if one[0].type_name in types)
             for channel, *_, data in islice(fitting, _LOOKED_AT):
