@@ -14,7 +14,7 @@ from tap_ros.base.options import Bags, Folder, ShippedFile, Topic
 from tap_ros.evaluation.intervals import against_copying, mean_interval
 from tap_ros.images.robot_mask import fill_from_past
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.recording.bags import reading_like
+from tap_ros.recording.bags import find_bags, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.forward_scores import measure_maps, measure_pictures, MOVED_PIXELS
 from tap_ros.training.frames import FilledStore
@@ -72,8 +72,9 @@ def run(args: Options) -> None:
     _, _, training = load_weights(args.weights, 'forward_model')
     rows = []
     for recording in args.recordings:
-        store = open_recordings([recording], reading=reading_like(
-            training, [recording], args.image_topic, model.camera_crop))
+        bags = find_bags(recording)
+        store = open_recordings(bags, reading=reading_like(
+            training, bags, args.image_topic, model.camera_crop))
         if store.image_size != (model.config.image_size,) * 2:
             raise ConfigError(f'{args.weights}: made for {model.config.image_size} pixels a side, '
                               f'{recording} has {store.image_size}; use matching ones')

@@ -24,7 +24,7 @@ from tap_ros.images.robot_mask import trained_robot_mask
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
-from tap_ros.recording.bags import reading_like
+from tap_ros.recording.bags import find_bags, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.training.frames import FilledStore
@@ -82,8 +82,9 @@ def run(args: Options) -> None:
     else:
         network, training = load_predictor(args.weights), {}
         size, trained = network.image_size[0], network.camera_crop
-    store = open_recordings(args.recordings, reading=reading_like(
-        training, args.recordings, args.image_topic, trained))
+    bags = find_bags(args.recordings)
+    store = open_recordings(bags, reading=reading_like(
+        training, bags, args.image_topic, trained))
     if store.image_size != (size, size):
         raise ConfigError(f'{args.weights}: made for {size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')

@@ -16,11 +16,10 @@ from tap_ros.base.options import File
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import film_strip, grid, png_bytes
-from tap_ros.recording.bags import check_first_picture, find_bags, list_topics
+from tap_ros.recording.bags import find_bags, list_topics
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.reading import reading_of, ReadingOptions
-from tap_ros.recording.topic_choice import find_topics
 from tap_ros.training.split import split_episodes, warn_if_few
 from tyro import conf
 
@@ -54,15 +53,12 @@ def run(args: Options) -> None:
         _, about = load_tensors(args.path)
         print(json.dumps(about, indent=2))
         return
-    found = list_topics(args.path)
-    for number, (topic, kind, count) in enumerate(found):
+    bags = find_bags(args.path)
+    for number, (topic, kind, count) in enumerate(list_topics(bags)):
         print(f'{"" if number else "topics":<11} {escaped(topic)}  {escaped(kind)}  '
               + ('unknown' if count is None else f'{count} messages'))
     reading = reading_of(args.reading)
-    check_first_picture([args.path], reading, 'the predictor')
-    cameras = {next(iter(find_topics(bag, camera))) for bag in find_bags(args.path)
-               for camera in reading.cameras}
-    store = open_recordings([args.path], reading=reading)
+    store = open_recordings(bags, reading=reading, network='the predictor')
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
@@ -74,7 +70,7 @@ def run(args: Options) -> None:
         f'cut into parts of at most {reading.episode_seconds:g} s (--episode-seconds)')
     masked = sum(e.robot_masks is not None for e in episodes)
     for name, value in (
-            ('told apart', apart), ('camera', listing(sorted(cameras))),
+            ('told apart', apart), ('camera', listing(store.cameras)),
             ('length', f'{lengths.min()} to {lengths.max()} frames, median '
                        f'{np.median(lengths):g}'),
             ('objects', listing(sorted({len(e.object_names) for e in episodes}))),

@@ -19,9 +19,10 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
-from tap_ros.recording.bags import check_first_picture, find_bags
+from tap_ros.recording.bags import find_bags
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import reading_of
+from tap_ros.recording.topic_choice import Bag
 from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.training.run_config import RunConfig
 from tap_ros.training.split import split_episodes, warn_if_few, with_masks
@@ -84,9 +85,9 @@ class Run(Generic[Config]):
         self.device = pick_device(config.device)
         if config.threads:
             torch.set_num_threads(config.threads)
-        reading, paths = reading_of(config), paths_of(config)
-        check_first_picture(paths, reading, f'the {self.kind.replace("_", " ")}')
-        self.store = open_recordings(paths, progress=self.progress, reading=reading)
+        self.store = open_recordings(
+            bags_of(config), progress=self.progress, reading=reading_of(config),
+            network=f'the {self.kind.replace("_", " ")}')
         self.training, self.held_out = with_masks(self.store, split_episodes(
             self.store, config.test_fraction, self._min_frames, config.held_out),
             config.robot_mask)
@@ -210,13 +211,12 @@ class Run(Generic[Config]):
                      about | {'settings': settings, 'scores': scores})
 
 
-def paths_of(config: RunConfig) -> list[str]:
+def bags_of(config: RunConfig) -> list[Bag]:
     """Return the recordings, and of those held out what is not among them."""
-    def files(path: str) -> set[Path]:
-        return {file.resolve() for bag in find_bags(path) for file in bag}
-
-    known = set().union(*map(files, config.recordings))
-    return [*config.recordings, *(path for path in config.held_out if not files(path) <= known)]
+    bags = find_bags(config.recordings)
+    known = {file.resolve() for bag in bags for file in bag.files}
+    return bags + [bag for bag in find_bags(config.held_out)
+                   if not {file.resolve() for file in bag.files} <= known]
 
 
 def _drawn_ahead(draw: Callable[[int], Item], first: int, last: int) -> Iterator[tuple[int, Item]]:

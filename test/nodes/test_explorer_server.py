@@ -242,9 +242,10 @@ def test_goals_placed_by_hand_leave_the_others_and_belong_to_their_picture():
     def message(stamp, **places):
         """Return objects that a tracker follows: (u, v, state) of each."""
         u, v, states = zip(*places.values())
-        return encode_objects(
-            places, np.column_stack([u, v]), np.full((len(u), 7), np.nan), to_stamp(stamp),
-            WORLD_FRAME, ObjectStates.SOURCE_TRACKED, states, [0.5] * len(u))
+        found = encode_objects(places, np.column_stack([u, v]), None, to_stamp(stamp),
+                               WORLD_FRAME, ObjectStates.SOURCE_TRACKED)
+        found.states, found.confidence = states, [0.5] * len(u)
+        return found
 
     placed = []
     with Client('hand') as node:

@@ -207,9 +207,10 @@ class GoalByHand:
         goals = {each: goal for each, goal in goals.items() if each in objects}
         goals[name] = *pixel, SEEN, 1.0
         u, v, states, confidence = zip(*goals.values())
-        self._publish(encode_objects(
-            goals, np.column_stack([u, v]), None, of.header.stamp, of.header.frame_id,
-            ObjectStates.SOURCE_TRACKED, states, confidence), 'goal/objects')
+        message = encode_objects(goals, np.column_stack([u, v]), None, of.header.stamp,
+                                 of.header.frame_id, ObjectStates.SOURCE_TRACKED)
+        message.states, message.confidence = states, confidence
+        self._publish(message, 'goal/objects')
 
     def _publish(self, message: Any, topic: str) -> None:
         kind = type(message)
