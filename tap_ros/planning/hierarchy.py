@@ -20,8 +20,7 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.planning.action_sequences import gripper_after
 from tap_ros.planning.cost import distances_to_all_pixels
 from tap_ros.planning.mpc_config import SWITCHES
-from tap_ros.planning.mpc_inputs import Goal, Scene
-from tap_ros.planning.visual_mpc import Plan, VisualMPC
+from tap_ros.planning.visual_mpc import Goal, Plan, Scene, VisualMPC
 
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
@@ -133,7 +132,7 @@ def choose_sample(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
     A leg goes to the first subgoal from what is seen, then from each predicted picture to the next
     target, the arm standing where the plan before left it.
 
-    :param scene: mpc_inputs.Scene, what is seen now.
+    :param scene: visual_mpc.Scene, what is seen now.
     :param goal_pixels: (K, 2).
     :param subgoals: of any samples, earliest first in each.
     :param plan: makes the plan of a leg, by `mpc`; what it raises ends the choice.

@@ -24,8 +24,7 @@ from tap_ros.base.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.base.text import listing
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.hierarchy import Itinerary, Target
-from tap_ros.planning.mpc_inputs import Goal, Scene
-from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
+from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 from tap_ros.tracking.protocols import LOST, UNSURE
 
 MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
@@ -203,16 +202,20 @@ class Reach:
         """Answer what is seen, whatever the time that has passed without a command."""
         if seen is None:
             return Wait(missing or 'nothing is seen')
-        reason = self._unusable(seen, now, missing)
-        if reason:
-            return Wait(reason)
+        if seen.stamp_ns <= self._after_ns:
+            return Wait(f'the last command was refused: {self._refusal}' if self._before is None
+                        and self._refusal else missing or 'no new picture since the last command')
+        if seen.stamp_ns < seen.scene_ns:
+            return Wait('the picture is of an old scene')
+        age = now - seen.received
+        if age > self._config.max_age:
+            return Wait(f'what was seen is {age:.1f} s old' + (f': {missing}' if missing else ''))
         if self._planned is not None and self._planned.seen.stamp_ns == seen.stamp_ns:
             return self._planned
         self._first = self._first or seen
         if self._state is None:
             return SelectTargets(seen)
-        return self._plan(
-            seen, self._state, seen.received + (1 - SENDING) * self._config.max_age - now)
+        return self._plan(seen, self._state, (1 - SENDING) * self._config.max_age - age)
 
     def interrupted(self, seen: Observation | None) -> End | None:
         """
@@ -222,8 +225,7 @@ class Reach:
         """
         if seen is None:
             return None
-        change = scene_change(self._first, seen) if self._first is not None else ''
-        if change:
+        if self._first is not None and (change := scene_change(self._first, seen)):
             return End('aborted', f'the scene has changed: {change}')
         doubt = self._doubt(seen) if seen.stamp_ns >= seen.scene_ns else ''
         return End('aborted', doubt) if doubt else None
@@ -256,12 +258,11 @@ class Reach:
         state = _State(Memory(self._seed), Itinerary(
             targets, self._budget - self.steps, config.switch, config.reached))
         if passed is not None and self._state is not None:
-            memory = self._state.memory
-            state = replace(state, round=passed.round + 1, first_step=self.steps,
-                            memory=replace(state.memory, heights=memory.heights,
-                                           blocked=memory.blocked),
-                            earlier=(*passed.earlier, *passed.itinerary.targets[:-1]),
-                            switches=passed.switches)
+            met = self._state.memory
+            state = replace(
+                state, memory=Memory(self._seed, heights=met.heights, blocked=met.blocked),
+                round=passed.round + 1, first_step=self.steps, switches=passed.switches,
+                earlier=(*passed.earlier, *passed.itinerary.targets[:-1]))
         self._state = self._next = state
         self._sent_at = now
 
@@ -301,18 +302,6 @@ class Reach:
         self._refusal, self._refused = reason, self._refused + 1
         return True
 
-    def _unusable(self, seen: Observation, now: float, missing: str) -> str:
-        """Say why there is nothing to plan from; an empty string if there is."""
-        if seen.stamp_ns <= self._after_ns:
-            return (f'the last command was refused: {self._refusal}' if self._before is None
-                    and self._refusal else missing or 'no new picture since the last command')
-        if seen.stamp_ns < seen.scene_ns:
-            return 'the picture is of an old scene'
-        age = now - seen.received
-        if age > self._config.max_age:
-            return f'what was seen is {age:.1f} s old' + (f': {missing}' if missing else '')
-        return ''
-
     def _plan(self, seen: Observation, state: _State,
               seconds: float) -> SelectTargets | Command | End:
         """Plan the next command from a new picture within so many seconds."""
@@ -333,28 +322,20 @@ class Reach:
         if (0 < stage == len(itinerary.targets) - 1 and state.round < config.rounds
                 and self.steps > state.first_step):
             return SelectTargets(seen)
+        # tabulate the goal, once unless objects are free
+        target, known = itinerary.targets[stage], self._tabulated
+        if known is None or known[0] is not target or target.free is not None:
+            inside = np.clip(pixels, 0, np.array(seen.image.shape[1::-1]) - 1)
+            known = self._tabulated = target, self._mpc.goal(**target.goal(inside))
         # plan
-        limit = np.array(seen.image.shape[1::-1]) - 1
-        goal = self._goal(itinerary.targets[stage], np.clip(pixels, 0, limit))
-        plan = self._mpc.plan(
-            Scene(seen.image, seen.gripper, pixels), goal, state.memory, config.limits, seconds)
+        plan = self._mpc.plan(Scene(seen.image, seen.gripper, pixels), known[1], state.memory,
+                              config.limits, seconds)
         self._next = replace(state, memory=plan.memory)
         return Command(plan, len(state.switches), seen)
 
-    def _goal(self, target: Target, pixels: np.ndarray) -> Goal:
-        """Return the planner's Goal for a target, tabulated once unless objects are free."""
-        known = self._tabulated
-        if known is None or known[0] is not target or target.free is not None:
-            known = self._tabulated = target, self._mpc.goal(**target.goal(pixels))
-        return known[1]
-
 
 def scene_change(first: Observation, seen: Observation) -> str:
-    """
-    Say in what way the scene is another one; an empty string if it is not.
-
-    :param first: Observation at the start of a goal; seen: Observation now.
-    """
+    """Say in what way a scene is another than at the start of a goal; '' if it is the same."""
     if seen.jumps != first.jumps:
         return 'the clock of its stamps has jumped: another simulator, or a recording that loops'
     if seen.scene_ns > first.stamp_ns:

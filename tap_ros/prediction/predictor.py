@@ -69,9 +69,9 @@ class SubgoalPredictor(Predictor):
         """
         Load a weights file.
 
-        :param path: written by training.
-        :param device: where to run it.
-        :return: SubgoalPredictor.
+        :param path: name of shipped weights, such as 'push2', or a file written by training.
+        :param device: where to run it, 'cpu' or 'cuda'.
+        :return: SubgoalPredictor, with pictures of its image_size.
         :raises WeightsError: if the file is missing, damaged or for something else.
         """
         return cls(*load_network(path, device), source=path)
@@ -89,8 +89,10 @@ class SubgoalPredictor(Predictor):
         through the network in one batch, where the last digits of an answer may differ from those
         of the request alone. Mind the memory: all their samples are held at once.
 
-        :return: see Predictor.
-        :raises ImageError: likewise; ConfigError: likewise.
+        :param requests: their fields are the arguments of predict.
+        :return: for each what predict returns.
+        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
+        :raises ConfigError: if a count is below 1, or a goal is missing or too much.
         """
         scenes = [check_request(request, self.mode, self.image_size) for request in requests]
         alike: dict[int, list[int]] = {}  # number of objects: [index of a request]

@@ -65,19 +65,35 @@ class Predictor(Protocol):
 
     def predict_together(self, requests: Sequence[Request]) -> list[list[Subgoal]]:
         """
-        Answer requests.
+        Answer several requests.
 
-        :return: for each a list of Subgoal: sample after sample, of each its subgoals in a row,
-            earliest first.
-        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
-        :raises ConfigError: if a count is below 1, or a goal is missing or too much.
+        :param requests: their fields are the arguments of predict.
+        :return: for each what predict returns.
+        :raises ImageError: as predict; ConfigError: likewise.
         """
         ...
 
     def predict(self, start: np.ndarray, goal: np.ndarray | None = None,
                 start_pixels: np.ndarray | None = None, goal_pixels: np.ndarray | None = None,
                 num_samples: int = 1, recursion_depth: int = 1, seed: int = 0) -> list[Subgoal]:
-        """Answer one request: the fields of Request; the rest as predict_together."""
+        """
+        Predict subgoals.
+
+        :param start: uint8 (H, W, 3) rgb, what is seen now; (H, W) is image_size.
+        :param goal: likewise, what is to be; None in mode 'forward'.
+        :param start_pixels: (K, 2) numbers, (u, v) of each object in the start picture; (0, 0) is
+            the centre of the top-left pixel. None: no objects.
+        :param goal_pixels: likewise, of the same objects in the goal picture; None in mode
+            'forward'.
+        :param num_samples: how many to draw; a predictor without random numbers answers one.
+        :param recursion_depth: how many subgoals in a row, at least 1.
+        :param seed: of what is random; the same arguments give the same answer.
+        :return: list of Subgoal: sample after sample, of each its subgoals in a row, earliest
+            first. Of each `image` uint8 (H, W, 3), `object_maps` float32 (K, H, W) that each sum
+            to 1, and `expected_pixels` float32 (K, 2).
+        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
+        :raises ConfigError: if a count is below 1, or a goal is missing or too much.
+        """
         return self.predict_together([Request(
             start, goal, start_pixels, goal_pixels, num_samples, recursion_depth, seed)])[0]
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.reach import (
     Command,
@@ -21,7 +20,7 @@ from tap_ros.planning.reach import (
     SelectTargets,
     Wait,
 )
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC
 from toy_world import SIZE, Telekinesis
 
 SECOND = 10**9

@@ -15,9 +15,9 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.planning.cost import PlanCost
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
 from tap_ros.planning.reach import Command, End, Observation, Reach, ReachConfig, SelectTargets
+from tap_ros.planning.visual_mpc import Scene
 from toy_world import SCALE, SIZE, Telekinesis
 
 START, GOAL = np.array([[8.0, 20.0]], np.float32), np.array([[20.0, 12.0]], np.float32)

@@ -15,9 +15,8 @@ from tap_ros.messages.objects import check_found, match_objects
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
-from tap_ros.planning.mpc_inputs import Goal, Scene
 from tap_ros.planning.reach import Observation, ReachConfig
-from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
+from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 from tap_ros.ros.client import Client
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import Observations

@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.base.contract import CAMERA_FRAME
+from tap_ros.base.contract import CAMERA_FRAME, MODES
 from tap_ros.base.errors import ConfigError, ImageError, TapError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import TrainedCrop
@@ -31,7 +31,6 @@ from tap_ros.ros.polling import PollOnlyGroup
 from tap_ros.ros.robot_view import RobotView
 from tap_ros.ros.subscriptions import publishers_of, rivals
 from tap_ros.ros.topics import camera_topics, encode_subgoal, goal_topics, LATCHED, STREAM
-from tap_ros.training.methods import MODES
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
