@@ -15,9 +15,8 @@ from sim_bridge.simulator import Simulator
 from tap_msgs.msg import CommandRefused, ObjectStates
 from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.ros.calls import CallError
-from tap_ros.ros.client import request_fields
-from tap_ros.ros.ros_messages import encode_image, encode_joints, encode_objects
-from tap_ros.ros.topics import STREAM, to_stamp
+from tap_ros.ros.requests import request_fields
+from tap_ros.ros.topics import encode_image, encode_joints, encode_objects, STREAM, to_stamp
 
 STOP_S = 0.5  # within which a stop has to come
 MOVING_S = 60.0  # a plan takes seconds where other programs run

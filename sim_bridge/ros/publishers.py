@@ -21,7 +21,7 @@ from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.messages import topics
 from tap_ros.robots.arm import Transform
 from tap_ros.robots.description import robot_description
-from tap_ros.ros import ros_messages
+from tap_ros.ros import topics as ros_topics
 from tap_ros.ros.topics import LATCHED, STREAM
 
 STREAMS = {'clock': Clock, 'joint_states': JointState, 'objects': ObjectStates,
@@ -63,18 +63,18 @@ class ScenePublishers:
             self._fixed = node.create_publisher(TFMessage, 'tf_static', LATCHED)
 
     def moment(self, world: World, seen: Observation, stamp: Time) -> None:
-        """Publish a moment; its transforms once: of a second time listeners would complain."""
+        """Publish a moment; its transforms once: listeners warn of a second time."""
         arm = world.arm
         self._newest = {
             'clock': Clock(clock=stamp),
-            'joint_states': ros_messages.encode_joints(
+            'joint_states': ros_topics.encode_joints(
                 seen.gripper, stamp, WORLD_FRAME,
                 dict(zip(arm.joints, seen.arm_joints)) if arm is not None else None),
             'objects': _objects(seen, stamp),
-            'camera/camera_info': ros_messages.encode_camera_info(
+            'camera/camera_info': ros_topics.encode_camera_info(
                 world.camera_matrix, seen.image.shape[:2], stamp, CAMERA_FRAME),
-            'camera/image_raw': ros_messages.encode_image(seen.image, stamp, CAMERA_FRAME),
-            'camera/robot_mask': ros_messages.encode_mask(seen.robot_mask, stamp, CAMERA_FRAME)}
+            'camera/image_raw': ros_topics.encode_image(seen.image, stamp, CAMERA_FRAME),
+            'camera/robot_mask': ros_topics.encode_mask(seen.robot_mask, stamp, CAMERA_FRAME)}
         self._world, self._viewers = world, 0  # who has been sent the observer's picture of it
         if arm is not None:
             _send(self._moving, arm.transforms(seen.arm_joints), stamp)
@@ -87,7 +87,7 @@ class ScenePublishers:
         if self._observer is not None:
             before, self._viewers = self._viewers, self._observer.get_subscription_count()
             if self._viewers > before:
-                self._observer.publish(ros_messages.encode_image(
+                self._observer.publish(ros_topics.encode_image(
                     ability(self._world, 'observer_picture')(), self._newest['clock'].clock,
                     CAMERA_FRAME))
 
@@ -95,9 +95,9 @@ class ScenePublishers:
         """Publish the goal of a scene."""
         self._publishers['goal/objects'].publish(_objects(goal, stamp))
         self._publishers['goal/image'].publish(
-            ros_messages.encode_image(goal.image, stamp, CAMERA_FRAME))
+            ros_topics.encode_image(goal.image, stamp, CAMERA_FRAME))
         self._publishers['goal/robot_mask'].publish(
-            ros_messages.encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
+            ros_topics.encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
 
     def frames(self, world: World, stamp: Time) -> None:
         """Tell where the cameras and the ends of the arm are in this scene."""
@@ -105,7 +105,7 @@ class ScenePublishers:
         if world.camera_pose is not None:
             fixed.append(Transform(WORLD_FRAME, CAMERA_FRAME, world.camera_pose))
             place, turn = _fields(world.camera_pose)
-            self._pose.publish(ros_messages.make_message(PoseStamped, {
+            self._pose.publish(ros_topics.make_message(PoseStamped, {
                 'header': {'stamp': {'sec': stamp.sec, 'nanosec': stamp.nanosec},
                            'frame_id': WORLD_FRAME},
                 'pose': {'position': place, 'orientation': turn}}))
@@ -114,7 +114,7 @@ class ScenePublishers:
 
 def _objects(observation: Observation, stamp: Time) -> ObjectStates:
     """Encode the objects of an Observation, which come from the simulator itself."""
-    return ros_messages.encode_objects(
+    return ros_topics.encode_objects(
         observation.object_names, observation.object_pixels, observation.object_poses, stamp,
         WORLD_FRAME, ObjectStates.SOURCE_GROUND_TRUTH)
 
@@ -130,7 +130,7 @@ def _send(publisher: Any, transforms: Iterable[Transform], stamp: Time) -> None:
             'header': {'stamp': {'sec': stamp.sec, 'nanosec': stamp.nanosec}, 'frame_id': parent},
             'child_frame_id': child,
             'transform': {'translation': place, 'rotation': turn}})
-    publisher.publish(ros_messages.make_message(publisher.msg_type, {'transforms': fields}))
+    publisher.publish(ros_topics.make_message(publisher.msg_type, {'transforms': fields}))
 
 
 def _fields(pose: np.ndarray) -> tuple[dict[str, float], dict[str, float]]:

@@ -3,6 +3,7 @@
 """The simulator as a ROS node: camera, objects and clock out, twist commands in."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 import math
 import time
 from typing import Any
@@ -21,14 +22,13 @@ from tap_msgs.msg import CommandRefused, Episode
 from tap_msgs.srv import ResetScene, SetGoal, StepScene
 from tap_ros.base.contract import ACTION_LIMIT, CONTROL_PERIOD, WORLD_FRAME
 from tap_ros.base.errors import TapError
-from tap_ros.base.plugins import names
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.robots.arm import DEFAULT_ARM
+from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
-from tap_ros.ros.parameters import Parameters
-from tap_ros.ros.services import answering
+from tap_ros.ros.parameters import Parameters, setting
 from tap_ros.ros.subscriptions import steady_timer
 from tap_ros.ros.topics import LATCHED, LOCK_STEP, SERVICE_QOS, STREAM, to_stamp
 
@@ -36,7 +36,6 @@ PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 COMMAND_TIMEOUT, MAX_TIMEOUT = 1.0, 60.0  # s that a command is valid, unless its sender says so
 MAX_PERIODS = 100  # of a call that is answered when they have passed: about a second
-OPTIONS = {'look': DEFAULT_LOOK, 'appearance': 'usual', 'arm': DEFAULT_ARM}  # if taken
 LAST_MARK_S = 1.0  # s that the end mark of the last episode may take to arrive
 
 
@@ -82,12 +81,10 @@ class SimNode(Node):
         self._lock_step = self.create_publisher(Bool, LOCK_STEP, LATCHED)
         self._lock_step.publish(Bool(data=self.params['lock_step']))
         # Subscribed before the twist, so that of two commands sent together it is taken first.
-        subscriptions: list[tuple[Any, str, Callable[..., None], Any]] = [
-            (Float64, 'gripper/command', self._on_gripper, STREAM),
-            (TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM),
-            (Float64, 'arm/command_timeout', self._on_timeout, LATCHED)]
-        for subscription in subscriptions:
-            self.create_subscription(*subscription)
+        subscribe: Callable[..., Any] = self.create_subscription  # rclpy does not type the info
+        subscribe(Float64, 'gripper/command', self._on_gripper, STREAM)
+        subscribe(TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM)
+        subscribe(Float64, 'arm/command_timeout', self._on_timeout, LATCHED)
         self._resend: Timer | None = None
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
@@ -95,16 +92,14 @@ class SimNode(Node):
                                    (StepScene, 'sim/step', self._on_step),
                                    (SetBool, 'sim/pause', self._on_pause)):
             self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
+        factor, mode = self.params['real_time_factor'], 'lock-step'
         if self.params['lock_step']:
-            mode = 'lock-step'
             self._resend = steady_timer(
                 self, self.params['resend_period'], self._topics.send_newest)
         else:
-            factor = self.params['real_time_factor']
             steady_timer(self, CONTROL_PERIOD / factor, self._on_timer)
             mode = f'{factor:g} x real time'
-        self.get_logger().info(
-            f'ready: task {task}, seed {self.params["seed"]}, {mode}')
+        self.get_logger().info(f'ready: task {task}, seed {self.params["seed"]}, {mode}')
 
     def close(self) -> None:
         """End the episode, and wait until its mark has been delivered."""
@@ -116,17 +111,13 @@ class SimNode(Node):
 
     def _on_gripper(self, message: Float64, info: dict[str, Any]) -> None:
         self._diagnostics.received('gripper/command')
-        reason = self._refuse_paused(info)
+        reason = self._refuse_paused(info) or ('' if math.isfinite(message.data) else (
+            f'data is {message.data}; expected a number from 0 (closed) to 1 (open)'))
         if reason:
             self.get_logger().warning(
                 f'gripper/command ignored: {reason}', throttle_duration_sec=5.0)
-            return
-        if not math.isfinite(message.data):
-            self.get_logger().warning(
-                f'gripper/command ignored: data is {message.data}; expected a number from '
-                '0 (closed) to 1 (open)')
-            return
-        self._opening = min(max(message.data, 0.0), 1.0)
+        else:
+            self._opening = min(max(message.data, 0.0), 1.0)
 
     def _on_twist(self, message: TwistStamped, info: dict[str, Any]) -> None:
         self._diagnostics.received('arm/delta_twist_cmds')
@@ -135,9 +126,8 @@ class SimNode(Node):
         if stamp_ns == 0 and not move.any():
             self._twist = None
             return
-        reason = (self._refuse_paused(info)
-                  or self._refuse_twist(message.twist, move, stamp_ns))
-        if reason:
+        if reason := self._refuse_paused(info) or self._refuse_twist(
+                message.twist, move, stamp_ns):
             self.get_logger().warning(f'arm/delta_twist_cmds ignored: {reason}')
             self._diagnostics.error(f'arm/delta_twist_cmds ignored: {reason}')
             self._refused.publish(CommandRefused(header=message.header, message=reason))
@@ -196,28 +186,23 @@ class SimNode(Node):
     def _on_timer(self) -> None:
         if not self._paused:
             move, self._twist = self._twist, None
-            if move is None or time.monotonic() > self._valid_until:
-                move = np.zeros(3)
-            self._step(move)
+            late = time.monotonic() > self._valid_until
+            self._step(np.zeros(3) if move is None or late else move)
 
     # Services
 
     def _on_reset(self, request: ResetScene.Request,
-                  response: ResetScene.Response) -> ResetScene.Response:
+                  _: ResetScene.Response) -> ResetScene.Response:
         self._reset(request.task or 'push2', request.seed, request.hide_arm)
-        response.success = True
-        response.message = f'{self._sim.task_name}, seed {request.seed}'
-        return response
+        return ResetScene.Response(
+            success=True, message=f'{self._sim.task_name}, seed {request.seed}')
 
-    def _on_set_goal(self, request: SetGoal.Request,
-                     response: SetGoal.Response) -> SetGoal.Response:
+    def _on_set_goal(self, request: SetGoal.Request, _: SetGoal.Response) -> SetGoal.Response:
         names, pixels = decode_objects(
             request.objects, 'objects', self._sim.goal().image.shape[:2])
         ability(self._sim, 'move_goal')(names, pixels)
         self._publish_goal()
-        response.success = True
-        response.message = f'moved {", ".join(names)}'
-        return response
+        return SetGoal.Response(success=True, message=f'moved {", ".join(names)}')
 
     def _on_step(self, request: StepScene.Request,
                  response: StepScene.Response) -> StepScene.Response:
@@ -236,28 +221,23 @@ class SimNode(Node):
         response.stamp = to_stamp(self._stamp_ns)
         return response
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def _on_pause(self, request: SetBool.Request, _: SetBool.Response) -> SetBool.Response:
         if request.data != self._paused:  # what was commanded and is not done yet is forgotten
             self._twist, self._opening = None, self._done_opening
             self._paused = request.data
             self._played_at = math.inf if self._paused else time.monotonic()
-        response.success = True
-        response.message = 'paused' if request.data else 'running'
-        return response
+        return SetBool.Response(success=True, message='paused' if request.data else 'running')
 
     # Simulation
 
     def _make_world(self, task: str) -> World:
-        options = {name: self.params[name] for name in OPTIONS
-                   if self.params[name] != OPTIONS[name]}
+        options = {name: self.params[name] for name in ('look', 'appearance', 'arm')
+                   if self.params[name] != getattr(SimParameters, name)}
         return make_world(self.params['world'], task, self.params['image_size'], **options)
 
     def _reset(self, task: str, seed: int, hide_arm: bool) -> None:
         """Start a scene; if it cannot be, the present one stays as it is."""
-        if task == self._sim.task_name:
-            sim = self._sim
-        else:
-            sim = self._make_world(task)
+        sim = self._sim if task == self._sim.task_name else self._make_world(task)
         self._end_episode()
         observation = sim.reset(seed)
         if sim is not self._sim:
@@ -312,37 +292,45 @@ class SimNode(Node):
         self._episode.publish(message)
 
 
+@dataclass(frozen=True)
+class SimParameters:
+    """
+    Parameters of the node.
+
+    :param world: The simulated world; other packages may add some.
+    :param task: Task of the first scene, one that the world has.
+    :param seed: Seed of the first scene.
+    :param image_size: Width and height of the pictures in pixels.
+    :param look: What the camera's pictures show: the whole arm at a wooden table, or its hand
+        alone.
+    :param arm: The arm at the table.
+    :param appearance: Table, light and camera; random: drawn from the seed of each scene.
+    :param observer: Publish observer/image_raw, the camera's view with the whole arm.
+    :param objects: Where the objects of all nodes come from: objects and goal/objects are the
+        ground truth, or tracker_node's, and the truth is on truth/objects and truth/goal/objects
+        (tracked).
+    :param lock_step: True: each twist command lets one control period pass, so that runs repeat
+        exactly. False: time passes by itself.
+    :param resend_period: Seconds after which, in lock-step, the newest picture is sent again.
+    :param real_time_factor: Simulated seconds per second when not in lock-step.
+    """
+
+    world: str = setting('mujoco_table', plugins='tap_ros.worlds')
+    task: str = 'push2'
+    seed: int = setting(0, between=(0, 2**62))
+    image_size: int = setting(64, between=(16, 1024))
+    look: str = setting(DEFAULT_LOOK, choices=tuple(LOOKS))
+    arm: str = setting(DEFAULT_ARM, plugins='tap_ros.arms')
+    appearance: str = setting('usual', choices=tuple(CHOICES))
+    observer: bool = False
+    objects: str = setting('truth', choices=('truth', 'tracked'))
+    lock_step: bool = False
+    resend_period: float = setting(0.2, between=(0.02, 10.0))
+    real_time_factor: float = setting(1.0, between=(0.05, 20.0))
+
+
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('world', 'mujoco_table', 'The simulated world; other packages may add '
-                       'some.', choices=names('tap_ros.worlds'))
-    parameters.declare('task', 'push2', 'Task of the first scene, one that the world has.')
-    parameters.declare('seed', 0, 'Seed of the first scene.', low=0, high=2**62)
-    parameters.declare('image_size', 64, 'Width and height of the pictures in pixels.',
-                       low=16, high=1024)
-    parameters.declare(
-        'look', OPTIONS['look'],
-        "What the camera's pictures show: the whole arm at a wooden table, or its hand alone.",
-        choices=list(LOOKS))
-    parameters.declare('arm', DEFAULT_ARM, 'The arm at the table.', choices=names('tap_ros.arms'))
-    parameters.declare(
-        'appearance', OPTIONS['appearance'], 'Table, light and camera; random: drawn from '
-        'the seed of each scene.', choices=list(CHOICES))
-    parameters.declare(
-        'observer', False, "Publish observer/image_raw, the camera's view with the whole arm.")
-    parameters.declare(
-        'objects', 'truth', 'Where the objects of all nodes come from: objects and goal/objects '
-        "are the ground truth, or tracker_node's, and the truth is on truth/objects and "
-        'truth/goal/objects (tracked).', choices=('truth', 'tracked'))
-    parameters.declare(
-        'lock_step', False,
-        'True: each twist command lets one control period pass, so that runs repeat exactly. '
-        'False: time passes by itself.')
-    parameters.declare(
-        'resend_period', 0.2,
-        'Seconds after which, in lock-step, the newest picture is sent again.',
-        low=0.02, high=10.0)
-    parameters.declare('real_time_factor', 1.0,
-                       'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
+    parameters.declare_fields(SimParameters)
     return parameters

@@ -12,7 +12,8 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
 from tap_ros.base.text import escaped
-from tap_ros.ros.client import Client, request_fields, subgoals_of
+from tap_ros.ros.client import Client
+from tap_ros.ros.requests import request_fields, subgoals_of
 from tyro import conf
 
 _Pixels = conf.arg(metavar='U,V [U,V ...]', help_behavior_hint='(default: of the topics)')

@@ -1,29 +1,67 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Calls with a time-out, of a node that another thread spins."""
+"""Calls with a time-out, services that answer whatever happens, and nodes that are spun."""
 
 from collections.abc import Callable
-from contextlib import suppress
-from functools import partial
 import threading
 import time
+import traceback
 from typing import Any, Self
 
 from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 from tap_ros.base.errors import TapError
+from tap_ros.base.text import escaped
 from tap_ros.ros.heartbeat import Liveness
-from tap_ros.ros.services import log_error, wait_for_some
-from tap_ros.ros.subscriptions import PollOnlyGroup
+from tap_ros.ros.polling import PollOnlyGroup, take_answers
 
 POLL_S = 0.05  # between two looks at whether a server is still there
 
 
 class CallError(TapError):
     """A service, action or topic did not answer in time, or refused."""
+
+
+def log_error(node: Node, what: str, error: BaseException) -> None:
+    """Log an error in one line; an unexpected one, that is no TapError, with its traceback."""
+    lines = [escaped(error, 1000)] if isinstance(error, TapError) else [
+        escaped(line) for line in ''.join(traceback.format_exception(error)).splitlines()]
+    for line in lines:
+        node.get_logger().error(f'{what}: {line}')
+
+
+def reason(node: Node, what: str, error: Exception) -> str:
+    """Return why something failed, for whoever asked for it; log what was not expected."""
+    if isinstance(error, TapError):
+        return str(error)
+    log_error(node, what, error)
+    return f'internal error: {type(error).__name__}: {escaped(error)}'
+
+
+def answering(node: Node, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Wrap the callback of a service so that any exception becomes a refusal with its reason."""
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except Exception as error:
+            return type(response)(success=False, message=reason(node, 'service', error))
+
+    return answer
+
+
+def spin_once(executor: Executor, node: Node) -> None:
+    """Run what is ready, within 0.1 s; a callback that raises is logged, and ends no node."""
+    try:
+        executor.spin_once(timeout_sec=0.1)
+    except ExternalShutdownException:
+        raise
+    except InvalidHandle:  # of what another thread destroyed just now
+        pass
+    except Exception as error:
+        log_error(node, 'a callback failed; the node goes on', error)
 
 
 class Spinner:
@@ -33,19 +71,17 @@ class Spinner:
     A thread that keeps spinning answers ten times faster than spinning once per call.
 
     :param node: rclpy Node; destroying it stays with the caller.
-    :ivar answers: callback group for service clients: another thread takes their answers, without
-        the executor, which looks at everything that the node has, three times for an answer.
+    :ivar answers: callback group of service clients whose answers another thread takes.
     """
 
     def __init__(self, node: Node) -> None:
-        self._node, self.answers = node, PollOnlyGroup()
+        self._node, self._stop, self.answers = node, threading.Event(), PollOnlyGroup()
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._stop = threading.Event()
-        spin = partial(self._executor.spin_once, timeout_sec=0.1)
         self._threads = [
-            threading.Thread(target=self._repeat, args=(do,), name=name, daemon=True)
-            for do, name in ((spin, 'spinner'), (self._take_answers, 'answers'))]
+            threading.Thread(target=self._repeat, args=do, name=name, daemon=True)
+            for name, *do in (('spinner', self._executor.spin_once, 0.1),
+                              ('answers', take_answers, node, self.answers))]
 
     def __enter__(self) -> Self:
         for thread in self._threads:
@@ -58,31 +94,19 @@ class Spinner:
             thread.join(timeout=5.0)
         self._executor.shutdown(timeout_sec=1.0)
 
-    def _repeat(self, do: Callable[[], object]) -> None:
+    def _repeat(self, do: Callable[..., object], *what: Any) -> None:
         """Do something until the end, whatever it raises: a node whose thread ends is deaf."""
         while not self._stop.is_set():
             try:
-                do()
+                do(*what)
             except (InvalidHandle, ExternalShutdownException):
                 self._stop.wait(0.001)  # another thread has destroyed something just now
             except Exception as error:
                 log_error(self._node, 'a callback failed; the node goes on', error)
 
-    def _take_answers(self) -> None:
-        clients = [one for one in self._node.clients if one.callback_group is self.answers]
-        if not clients:
-            self._stop.wait(POLL_S)
-            return
-        for client in wait_for_some(self._node.context, clients):
-            header, answer = client.handle.take_response(client.srv_type.Response)
-            if header is not None:
-                with suppress(KeyError):  # given up
-                    client.get_pending_request(
-                        header.request_id.sequence_number).set_result(answer)
-
 
 def call(client: Client, request: Any, timeout_s: float,
-         give_up: Callable[[], bool] = lambda: False, server: Liveness | None = None) -> Any:
+         give_up: Callable[[], object] = lambda: False, server: Liveness | None = None) -> Any:
     """
     Call a service from a thread that does not spin the node.
 
@@ -118,7 +142,7 @@ def call(client: Client, request: Any, timeout_s: float,
 
 
 def wait_for_answer(future: Future, deadline: float, left: str, gone: Callable[[], bool],
-                    give_up: Callable[[], bool] = lambda: False) -> bool:
+                    give_up: Callable[[], object] = lambda: False) -> bool:
     """
     Wait for what a server answers, however long it is silent.
 

@@ -3,13 +3,11 @@
 """The nodes as one plain class: arrays in, arrays out, no rclpy to know."""
 
 import atexit
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-import math
+from collections.abc import Callable, Mapping, Sequence
 import secrets
 import threading
 import time
-from typing import Any, Self, TYPE_CHECKING
+from typing import Any, Self
 
 from action_msgs.srv import CancelGoal
 from lifecycle_msgs.msg import Transition
@@ -23,27 +21,28 @@ from rclpy.exceptions import InvalidNamespaceException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
-from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal, ResetScene, SelectObjects, SetGoal, StepScene
-from tap_ros.base.contract import CAMERA_FRAME
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import escaped, listing
-from tap_ros.messages.images import decode_image
-from tap_ros.messages.objects import decode_objects
-from tap_ros.messages.subgoals import decode_subgoals
+from tap_ros.messages.subgoals import Subgoal
 from tap_ros.ros.calls import call, CallError, Spinner
 from tap_ros.ros.heartbeat import Liveness
-from tap_ros.ros.observations import Observations
 from tap_ros.ros.reaching import CANCEL, CLIENT, Goals, Reaching
-from tap_ros.ros.ros_messages import encode_image, encode_objects
+from tap_ros.ros.requests import (
+    by_name,
+    is_text,
+    make_request,
+    names_of,
+    pixels_of,
+    request_fields,
+    seconds_of,
+    subgoals_of,
+)
 from tap_ros.ros.run import configure_fast_dds
-from tap_ros.ros.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
-
-if TYPE_CHECKING:
-    from tap_ros.messages.subgoals import Subgoal
+from tap_ros.ros.topics import SERVICE_QOS, to_stamp
+from tap_ros.ros.views import View, Views
 
 SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offers it
     'predict': (PredictSubgoal, 'predict_subgoal', 'predictor_node'),
@@ -61,28 +60,6 @@ SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offer
 READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'tracker_node': 'select',
          'recorder_node': 'record', 'visual_mpc_node': 'cancel'}
 PLANNER = 'visual_mpc_node'
-FOREVER_S = 1e9  # longer than threads can wait
-VIEWS = {'camera': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
-         'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
-
-
-@dataclass(frozen=True)
-class View:
-    """
-    A picture and the objects in it.
-
-    :param image: (H, W, 3) uint8.
-    :param names: of K objects.
-    :param pixels: (K, 2) float32, (u, v) of each.
-    :param positions: (K, 3) m; NaN where nobody knows them.
-    :param stamp_ns: of the picture.
-    """
-
-    image: np.ndarray
-    names: tuple[str, ...]
-    pixels: np.ndarray
-    positions: np.ndarray
-    stamp_ns: int
 
 
 class Client:
@@ -101,7 +78,7 @@ class Client:
 
     def __init__(self, namespace: str = '', timeout_s: float = 20.0,
                  node: Node | None = None) -> None:
-        self.timeout_s = _seconds(timeout_s)
+        self.timeout_s = seconds_of(timeout_s)
         self._context: Context | None = None
         if node is None:
             configure_fast_dds()
@@ -120,6 +97,7 @@ class Client:
         self.node = node
         self._group = ReentrantCallbackGroup()
         self.answers = self._group if self._context is None else self._spinner.answers
+        self._views = Views(node, self._group)
         self._lock = threading.RLock()
         self._made: dict[str, Any] = {}  # what was asked for so far
         atexit.register(self.close)  # a goal has an owner, and threads end before Python does
@@ -152,6 +130,10 @@ class Client:
         silence: str = self._liveness(name).silence
         return silence
 
+    def find(self, service: str) -> None:
+        """Look for one of SERVICES, and hear its node's heartbeat, from now on."""
+        self._service(service)
+
     def wait_until_ready(self, *names: str, timeout_s: float = 90.0) -> None:
         """
         Wait until nodes are ready.
@@ -160,7 +142,7 @@ class Client:
         :param timeout_s: most seconds to wait.
         :raises CallError: naming those that are not ready in time.
         """
-        deadline = time.monotonic() + _seconds(timeout_s)
+        deadline = time.monotonic() + seconds_of(timeout_s)
         waiting = names or ('predictor_node', PLANNER)
         while waiting := tuple(name for name in waiting if not self.is_ready(name)):
             if time.monotonic() > deadline:
@@ -169,7 +151,7 @@ class Client:
             time.sleep(0.1)
 
     def call(self, service: str, timeout_s: float | None = None,
-             give_up: Callable[[], bool] = lambda: False, **fields: Any) -> Any:
+             give_up: Callable[[], object] = lambda: False, **fields: Any) -> Any:
         """
         Call a service with messages, as they are in ROS.
 
@@ -181,7 +163,7 @@ class Client:
         """
         seconds, client = self._timeout(timeout_s), self._service(service)
         kind, _, server = SERVICES[service]
-        response = call(client, _message(kind.Request, fields), seconds, give_up,
+        response = call(client, make_request(kind.Request, fields), seconds, give_up,
                         self._liveness(server))
         if not getattr(response, 'success', True):
             reason = getattr(response, 'message', 'the log of its node says why')
@@ -193,7 +175,7 @@ class Client:
     def predict(self, start: np.ndarray | None = None, goal: np.ndarray | None = None,
                 start_pixels: np.ndarray | None = None, goal_pixels: np.ndarray | None = None,
                 num_samples: int = 1, recursion_depth: int = 1, seed: int = 0, mode: str = '',
-                timeout_s: float | None = None) -> 'list[Subgoal]':
+                timeout_s: float | None = None) -> list[Subgoal]:
         """
         Ask the predictor for subgoals, as SubgoalPredictor.predict in one process.
 
@@ -235,12 +217,12 @@ class Client:
         :return: Reaching, once the goal is accepted; it ends with this client at the latest.
         :raises CallError: when the planner does not answer, or rejects it: it has another goal.
         """
-        pixels = _places(goal_pixels or {})
-        request = _message(ReachGoal.Goal, request_fields(
+        pixels = by_name(goal_pixels or {})
+        request = make_request(ReachGoal.Goal, request_fields(
             tuple(pixels), goal_image=goal, goal_objects=list(pixels.values()) or None) | {
                 'mode': mode, 'step_budget': step_budget, 'recursion_depth': recursion_depth,
                 'num_samples': num_samples, 'seed': seed})
-        return Reaching(self.goals, request, _seconds(timeout_s), self.timeout_s, on_feedback)
+        return Reaching(self.goals, request, seconds_of(timeout_s), self.timeout_s, on_feedback)
 
     def weights(self) -> str:
         """Return the predictor's weights, a name or a file."""
@@ -252,7 +234,7 @@ class Client:
 
         :raises CallError: when it cannot load them; then it has none.
         """
-        if not _is_text(weights):
+        if not is_text(weights):
             raise ConfigError(f'weights: expected a text, got {escaped(repr(weights), 60)}')
 
         def change(*transitions: int) -> None:
@@ -279,8 +261,8 @@ class Client:
         """
         left = _countdown('reset', self.timeout_s)
         scene: dict[str, Any] = {'task': task, 'seed': seed, 'hide_arm': hide_arm}
-        _message(ResetScene.Request, scene)  # raises before anything is waited for
-        self._views('goal')  # subscribed before something comes
+        make_request(ResetScene.Request, scene)  # raises before anything is waited for
+        self._views.subscribe('goal')  # before something comes
         before = self.camera(objects=objects, timeout_s=left()).stamp_ns
         self.call('reset', left(), **scene)
         goal = self.goal(before, objects, left())
@@ -293,13 +275,13 @@ class Client:
         :param stamp_ns: of the picture that was clicked: none that is older is used.
         :raises CallError: with the reason, such as a click on the robot; then nothing changes.
         """
-        u, v = _pixels(list(_places(pixels).values()), 'pixels').T.tolist()
-        self.call('select', names=_names(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
+        u, v = pixels_of(list(by_name(pixels).values()), 'pixels').T.tolist()
+        self.call('select', names=names_of(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""
         self.call('set_goal', **request_fields(
-            tuple(_places(pixels)), objects=list(pixels.values())))
+            tuple(by_name(pixels)), objects=list(pixels.values())))
 
     def pause(self, paused: bool = True) -> None:
         """Pause the simulator, or let it go on."""
@@ -320,14 +302,12 @@ class Client:
         :param objects: wait for one with the objects in it.
         :raises CallError: naming the silent topic.
         """
-        return self._view('camera', after_ns, objects, timeout_s)
+        return self._views.wait('camera', after_ns, objects, self._timeout(timeout_s))
 
     def goal(self, after_ns: int = -1, objects: bool = True,
              timeout_s: float | None = None) -> View:
         """Return the newest goal picture, as camera does."""
-        return self._view('goal', after_ns, objects, timeout_s)
-
-    # What is made when it is asked for first
+        return self._views.wait('goal', after_ns, objects, self._timeout(timeout_s))
 
     def _once(self, name: str, make: Callable[[], Any]) -> Any:
         with self._lock:
@@ -355,88 +335,7 @@ class Client:
         return self._once(name, lambda: Liveness(self.node, name, self._group))
 
     def _timeout(self, timeout_s: float | None) -> float:
-        return self.timeout_s if timeout_s is None else _seconds(timeout_s)
-
-    def _views(self, name: str) -> Any:
-        def subscribed() -> Observations:
-            views = Observations(*VIEWS[name], latched=name == 'goal')
-            views.subscribe(self.node, VIEWS[name], LATCHED if name == 'goal' else STREAM,
-                            self._group)
-            return views
-        return self._once(name, subscribed)
-
-    def _view(self, name: str, after_ns: int, objects: bool, timeout_s: float | None) -> View:
-        views, timeout_s = self._views(name), self._timeout(timeout_s)
-        found = views.wait(('image', 'objects') if objects else ('image',), timeout_s, after_ns)
-        if found is None:
-            silent = 'objects' if views.newest('image', after_ns=after_ns) else 'image'
-            raise CallError(f'{views.names([silent], explained=True)}: '
-                            f'nothing new came within {timeout_s:g} s')
-        listed = found.messages.get('objects', ObjectStates())
-        return View(decode_image(found.messages['image'], VIEWS[name]['image'][1]),
-                    *decode_objects(listed, VIEWS[name]['objects'][1]), positions_of(listed),
-                    found.stamp_ns)
-
-
-def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any]:
-    """
-    Turn pictures (H, W, 3) and pixels (K, 2) into messages; leave out those that are None.
-
-    :param names: of the objects; by default 'object 1' and so on.
-    :param arrays: by field; what is called `objects`, or ends so, are pixels.
-    :return: {field: message}.
-    :raises ConfigError: for other shapes, and for what is no text or number.
-    """
-    fields: dict[str, Any] = {}
-    for name, values in arrays.items():
-        if name.endswith('objects') and values is not None:
-            pixels = _pixels(values, name)
-            fields[name] = encode_objects(
-                _names(names or [f'object {k + 1}' for k in range(len(pixels))]), pixels, None,
-                to_stamp(0), CAMERA_FRAME, ObjectStates.SOURCE_TRACKED)
-        elif values is not None:
-            picture = np.asarray(values)
-            if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
-                raise ConfigError(f'{name}: expected a picture, uint8 (height, width, 3), got '
-                                  f'{picture.dtype} {picture.shape}')
-            fields[name] = encode_image(picture, to_stamp(0), CAMERA_FRAME)
-    return fields
-
-
-def positions_of(message: ObjectStates) -> np.ndarray:
-    """Return (K, 3) metres."""
-    points = [state.pose.position for state in message.objects]
-    return np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
-
-
-def subgoals_of(response: PredictSubgoal.Response) -> 'list[Subgoal]':
-    """Return the subgoals of an answer, their objects in the order of the first one."""
-    if not response.subgoals:
-        return []
-    first = response.subgoals[0]
-    return decode_subgoals(
-        response, tuple(first.object_names), (first.image.height, first.image.width))
-
-
-def _message(kind: Callable[..., Any], fields: Mapping[str, Any]) -> Any:
-    """Return a message; raise ConfigError for what one of its fields cannot hold."""
-    for name, value in fields.items():
-        for text in value if isinstance(value, (list, tuple, set)) else [value]:
-            if isinstance(text, str) and not _is_text(text):
-                raise ConfigError(f'{name}: expected a text, got {escaped(repr(text), 60)}')
-    try:
-        return kind(check_fields=True, **fields)
-    except AssertionError as error:
-        raise ConfigError(escaped(error)) from error
-
-
-def _seconds(value: Any) -> float:
-    """Return a time-out; raise ConfigError for what is no positive number."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not (
-            0 < value < math.inf):
-        raise ConfigError(
-            f'timeout_s: expected a positive number of seconds, got {escaped(value, 40)}')
-    return min(float(value), FOREVER_S)
+        return self.timeout_s if timeout_s is None else seconds_of(timeout_s)
 
 
 def _countdown(what: str, seconds: float) -> Callable[[], float]:
@@ -448,40 +347,3 @@ def _countdown(what: str, seconds: float) -> Callable[[], float]:
             raise CallError(f'{what}: not done within {seconds:g} s')
         return round(found, 2) or found  # as errors print it
     return left
-
-
-def _names(names: Iterable[Any]) -> list[str]:
-    """Return names of objects; raise ConfigError for what a message cannot hold."""
-    for name in (names := list(names)):
-        if not _is_text(name):
-            raise ConfigError(
-                f'the name of an object: expected a text, got {escaped(repr(name), 60)}')
-    return names
-
-
-def _places(pixels: Any) -> Mapping[str, Any]:
-    """Return pixels by name; raise ConfigError for what is no mapping."""
-    if not isinstance(pixels, Mapping):
-        raise ConfigError('expected pixels by the names of objects, {name: (u, v)}, got '
-                          f'{escaped(repr(pixels), 60)}')
-    return pixels
-
-
-def _is_text(value: Any) -> bool:
-    """Tell whether a value is a text that UTF-8 can hold."""
-    try:
-        return isinstance(value, str) and bool(value.encode() or True)
-    except UnicodeError:
-        return False
-
-
-def _pixels(values: Any, what: str) -> np.ndarray:
-    """Return pixels (K, 2); raise ConfigError for what is none."""
-    try:
-        pixels = np.asarray(values, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        pixels = np.empty(0)
-    if pixels.ndim != 2 or pixels.shape[1] != 2 or not np.isfinite(pixels).all():
-        raise ConfigError(f'{what}: expected pixels (u, v), two finite numbers for each object, '
-                          f'got {escaped(values, 60)}')
-    return pixels

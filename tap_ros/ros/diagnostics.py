@@ -15,7 +15,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from tap_ros.base.text import escaped
-from tap_ros.ros.subscriptions import rivals, steady_timer, why_silent
+from tap_ros.ros.subscriptions import publishers_of, rivals, steady_timer, why_silent
 
 PERIOD = 1.0  # s
 STALE_S = 2.0  # s without a message after which a stream is stale
@@ -118,9 +118,9 @@ class Diagnostics:
             for topic, source in self._inputs.items():
                 message.status.append(self._describe_input(topic, source, now))
         self._publisher.publish(message)
-        self._tell_silence(now)
+        self._log_silence(now)
 
-    def _tell_silence(self, now: float) -> None:
+    def _log_silence(self, now: float) -> None:
         """Warn, once each time, of inputs that are silent, and of cameras that share a topic."""
         silent = {topic for topic, source in self._inputs.items()
                   if now - max(source.newest, self._begun) > SILENT_SECONDS and (
@@ -130,7 +130,7 @@ class Diagnostics:
             one.topic_name: one.msg_type for one in list(self._node.subscriptions)}
         cameras = {topic: found for topic, age in self._max_age_s.items()
                    if age < math.inf and types.get(topic) in CAMERA_TYPES
-                   and (found := rivals(self._node, [topic]))}
+                   and (found := rivals(publishers_of(self._node, topic)))}
         for topic in sorted(cameras.keys() - self._shared):
             self._node.get_logger().warning(f'{escaped(cameras[topic])}; leave one of them')
         self._shared = {*cameras}

@@ -73,8 +73,7 @@ class Presence:
 
 def publishers_present(node: Node, topic: str) -> Presence:
     """Return the Presence of those that publish a topic now."""
-    return Presence(lambda: [one for found in publishers_of(node, [topic]).values()
-                             for one in found])
+    return Presence(lambda: set().union(*publishers_of(node, topic).values()))
 
 
 class Liveness:

@@ -8,14 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from tap_ros.base.errors import WeightsError
 from tap_ros.base.text import escaped
-from tap_ros.ros.services import log_error
+from tap_ros.ros.calls import log_error
 from tap_ros.ros.topics import LATCHED
 from tap_ros.weights.weights import stored_digest
 
@@ -44,7 +44,9 @@ class LifecycleBase(LifecycleNode):
         self._loaded = self._card = ''
         self._cards = self.create_publisher(String, '~/model_card', LATCHED)
         self.add_on_set_parameters_callback(self._check_weights)
-        self._service_change_state.callback = self._answering(self._service_change_state.callback)
+        served = {service.srv_type: service for service in self.services}
+        self._get_state: Callable[..., Any] = served[GetState].callback
+        served[ChangeState].callback = self._answering(served[ChangeState].callback)
 
     # What a subclass implements
 
@@ -98,7 +100,7 @@ class LifecycleBase(LifecycleNode):
         """Return why the node does not work and the remedy; '' while it is active."""
         if self.active:
             return ''
-        state, command = self._state(), f'ros2 lifecycle set {self.get_fully_qualified_name()}'
+        state, command = self._state, f'ros2 lifecycle set {self.get_fully_qualified_name()}'
         return {
             'finalized': 'the node is shut down; start it again',
             'inactive': f'the node is inactive; activate it: {command} activate',
@@ -158,25 +160,26 @@ class LifecycleBase(LifecycleNode):
         def answer(request: Any, response: Any) -> Any:
             try:
                 return callback(request, response)
-            except rclpy_implementation.RCLError:
+            except RuntimeError:
                 wanted = escaped(request.transition.label or request.transition.id, 40)
                 self.get_logger().warning(
-                    f'change_state: a node that is {self._state()} has no transition {wanted}')
+                    f'change_state: a node that is {self._state} has no transition {wanted}')
                 response.success = False
                 return response
 
         return answer
 
+    @property
     def _state(self) -> str:
         """Return the label of the present state."""
-        label: str = self._state_machine.current_state[1]
+        label: str = self._get_state(None, GetState.Response()).current_state.label
         return label
 
     def _check_weights(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse other weights unless the node is unconfigured."""
         same = all(one.name != 'weights' or not self.has_parameter('weights')
                    or one.value == self.get_parameter('weights').value for one in parameters)
-        if same or self._state() in ('unconfigured', 'finalized'):
+        if same or self._state in ('unconfigured', 'finalized'):
             return SetParametersResult(successful=True)
         steps = ['deactivate'] * self.active + ['cleanup']
         return SetParametersResult(successful=False, reason=(

@@ -3,8 +3,9 @@
 """Parameters with a description and a range, and those that several nodes have."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -17,32 +18,97 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from tap_ros.base import plugins
 from tap_ros.base.contract import ROBOT_MASKS
 from tap_ros.base.errors import ConfigError
-from tap_ros.base.plugins import names
 from tap_ros.base.text import listing
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
 
 FARTHEST = 100.0  # m; no camera is there
-# Of several nodes: default, description, and what else Parameters.declare takes.
-SHARED: dict[str, tuple[Any, str, dict[str, Any]]] = {
-    'autostart': (
-        True, 'Load the weights and be active at once; false: wait for the transitions configure '
-        'and activate.', {}),
-    'device': (
-        'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
-        {'choices': ('cpu', 'cuda')}),
-    'image_transport': (
-        'raw', 'How the camera sends pictures: sensor_msgs/Image on camera/image_raw (raw), or '
-        'CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).',
-        {'choices': ('raw', 'compressed')}),
-    'robot_mask': (
-        'none', 'What camera/robot_mask takes out of the pictures: nothing (none), the arm with '
-        'its shadow (arm), or the whole robot (all). What was seen there free last takes its '
-        'place.', {'choices': ROBOT_MASKS}),
-    'joint_prefix': (
-        '', "What the names of the robot's joints begin with in joint_states, before "
-        'shoulder_pan_joint and so on.', {})}
+OF_RCLPY = {'use_sim_time', 'start_type_description_service'}  # parameters of any node
+def setting(default: Any, **limits: Any) -> Any:
+    """
+    Return a field of a dataclass of parameters, whose `:param` lines describe them.
+
+    :param limits: what else Parameters.declare takes; plugins: the choices are the names of this
+        group of entry points.
+    """
+    return field(default=default, metadata=limits)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """
+    Parameters that several nodes have.
+
+    :param autostart: Load the weights and be active at once; false: wait for the transitions
+        configure and activate.
+    :param device: Where the network runs, as torch names it: cpu, cuda.
+    :param image_transport: How the camera sends pictures: sensor_msgs/Image on camera/image_raw
+        (raw), or CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).
+    :param robot_mask: What camera/robot_mask takes out of the pictures: nothing (none), the arm
+        with its shadow (arm), or the whole robot (all). What was seen there free last takes its
+        place.
+    :param joint_prefix: What the names of the robot's joints begin with in joint_states, before
+        shoulder_pan_joint and so on.
+    :param arm: The arm. Heeded, as where it stands, where joint_states has its joints and not
+        gripper_x.
+    :param fixed_opening: Opening of the gripper, 0 to 1, where no joint_states has
+        gripper_opening; 0 is closed, as for pushing.
+    """
+
+    autostart: bool = True
+    device: str = setting('cpu', choices=('cpu', 'cuda'))
+    image_transport: str = setting('raw', choices=('raw', 'compressed'))
+    robot_mask: str = setting('none', choices=ROBOT_MASKS)
+    joint_prefix: str = ''
+    arm: str = setting(DEFAULT_ARM, plugins='tap_ros.arms')
+    fixed_opening: float = setting(0.0, between=(0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class MountParameters:
+    """
+    Where an arm stands.
+
+    :param mount_x: x of the base of the arm in the world, m; of its controller's frame "base".
+    :param mount_y: y of the base of the arm in the world, m; of its controller's frame "base".
+    :param mount_z: z of the base of the arm in the world, m; of its controller's frame "base".
+    :param mount_turn: Turn of that frame about the vertical, rad; the base stands upright.
+    :param tool_length: From the flange to the fingertips along its z, m.
+    """
+
+    mount_x: float = setting(0.0, between=(-10.0, 10.0))
+    mount_y: float = setting(0.0, between=(-10.0, 10.0))
+    mount_z: float = setting(0.0, between=(-10.0, 10.0))
+    mount_turn: float = setting(0.0, between=(-2 * math.pi, 2 * math.pi))
+    tool_length: float = setting(0.0, between=(0.0, 2.0))
+
+
+@dataclass(frozen=True)
+class CameraParameters:
+    """
+    Where the camera is, and what counts of its camera_info.
+
+    :param camera_x: x of the camera in the world, for robot_mask_node in base_frame, m.
+    :param camera_y: y of the camera, m; likewise.
+    :param camera_z: z of the camera, m; likewise. With 0 tracker_node takes camera/pose.
+    :param camera_qx: x of the quaternion that turns the camera's optical frame (z forward, x
+        right, y down in the picture) into that frame.
+    :param camera_qy: y of that quaternion.
+    :param camera_qz: z of that quaternion.
+    :param camera_qw: w of that quaternion.
+    :param rectified: The pictures are rectified: P of camera_info counts, else K.
+    """
+
+    camera_x: float = setting(0.0, between=(-FARTHEST, FARTHEST))
+    camera_y: float = setting(0.0, between=(-FARTHEST, FARTHEST))
+    camera_z: float = setting(0.0, between=(-FARTHEST, FARTHEST))
+    camera_qx: float = setting(1.0, between=(-1.0, 1.0))
+    camera_qy: float = setting(0.0, between=(-1.0, 1.0))
+    camera_qz: float = setting(0.0, between=(-1.0, 1.0))
+    camera_qw: float = setting(0.0, between=(-1.0, 1.0))
+    rectified: bool = False
 
 
 class Parameters:
@@ -50,10 +116,15 @@ class Parameters:
     The parameters of one node: declare each once, then read them by name.
 
     :param node: rclpy Node.
+    :ivar given: names of those that were given at the start, where rclpy has declared them for
+        that; they are declared anew, as the node has them.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self.given = set(node.list_parameters([], 0).names) - OF_RCLPY
+        for name in self.given:
+            node.undeclare_parameter(name)
         self._choices: dict[str, tuple[str, ...]] = {}
         node.add_on_set_parameters_callback(self._check_choices)
 
@@ -61,8 +132,8 @@ class Parameters:
         """Return the present value."""
         return self._node.get_parameter(name).value
 
-    def declare(self, name: str, default: Any, description: str, low: float | None = None,
-                high: float | None = None, choices: Sequence[str] | None = None,
+    def declare(self, name: str, default: Any, description: str,
+                between: tuple[float, float] | None = None, choices: Sequence[str] | None = None,
                 read_only: bool = True) -> Any:
         """
         Declare one parameter and return its value.
@@ -70,18 +141,18 @@ class Parameters:
         :param name: name of the parameter.
         :param default: its value unless one is given at the start; also sets the type.
         :param description: one sentence with the unit.
-        :param low: smallest value of a number; goes with `high`.
-        :param high: largest value of a number.
+        :param between: smallest and largest value of a number.
         :param choices: the only values of a string.
         :param read_only: False if a running node heeds a change.
         :return: the value.
         :raises ConfigError: when the value given at the start is of another type or out of range.
         """
         descriptor = ParameterDescriptor(description=description, read_only=read_only)
-        if low is not None and high is not None and isinstance(default, float):
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(low), to_value=float(high))]
-        elif low is not None:
+        if between is not None and isinstance(default, float):
+            low, high = map(float, between)
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        elif between is not None:
+            low, high = map(int, between)
             descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
         if choices is not None:
             self._choices[name] = tuple(choices)
@@ -93,51 +164,41 @@ class Parameters:
             raise ConfigError(
                 f'parameter {name}: {reason}. {description} Default: {default!r}') from error
 
+    def declare_fields(self, kind: type, *names: str, **defaults: Any) -> None:
+        """
+        Declare the fields of a dataclass.
+
+        :param names: of those to declare; by default all. defaults: other ones than the usual.
+        """
+        about = dict(re.findall(
+            r':param (\w+): (.*?)\s*(?=:param|\Z)', kind.__doc__ or '', re.DOTALL))
+        for one in fields(kind):
+            if not names or one.name in names:
+                limits = dict(one.metadata)
+                if 'plugins' in limits:
+                    limits['choices'] = plugins.names(limits.pop('plugins'))
+                self.declare(one.name, defaults.get(one.name, one.default),
+                             ' '.join(about[one.name].split()), **limits)
+
     def declare_shared(self, *names: str, **defaults: Any) -> None:
-        """Declare some of SHARED, with their usual or with other defaults."""
-        for name in (*names, *defaults):
-            default, description, limits = SHARED[name]
-            self.declare(name, defaults.get(name, default), description, **limits)
+        """Declare some of Shared, with their usual or with other defaults."""
+        self.declare_fields(Shared, *names, *defaults, **defaults)
 
     def declare_arm(self) -> None:
         """Declare arm, mount and opening: used for joint states that lack the gripper's."""
-        arm = self.declare(
-            'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
-            'joints and not gripper_x.', choices=names('tap_ros.arms'))
-        self.declare_mount(arm)
-        self.declare('fixed_opening', 0.0,
-                     'Opening of the gripper, 0 to 1, where no joint_states has '
-                     'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
+        self.declare_shared('arm', 'fixed_opening')
+        self.declare_mount(self['arm'])
 
     def declare_mount(self, arm: str) -> None:
         """Declare the place of an arm; by default at the simulated table."""
-        default = get_arm(arm).mount
-        for axis, value in zip('xyz', default.position):
-            self.declare(
-                f'mount_{axis}', value, f'{axis} of the base of the arm in the world, m; of its '
-                'controller\'s frame "base".', low=-10.0, high=10.0)
-        self.declare('mount_turn', default.yaw,
-                     'Turn of that frame about the vertical, rad; the base stands upright.',
-                     low=-2 * math.pi, high=2 * math.pi)
-        self.declare('tool_length', default.tool,
-                     'From the flange to the fingertips along its z, m.', low=0.0, high=2.0)
-
-    def declare_camera(self, frame: str) -> None:
-        """Declare the pose of the camera in a frame, and what counts of its camera_info."""
-        for axis in 'xyz':
-            self.declare(f'camera_{axis}', 0.0, f'{axis} of the camera in {frame}, m.',
-                         low=-FARTHEST, high=FARTHEST)
-        for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
-            self.declare(
-                f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
-                f'optical frame (z forward, x right, y down in the picture) into {frame}.',
-                low=-1.0, high=1.0)
-        self.declare('rectified', False,
-                     'The pictures are rectified: P of camera_info counts, else K.')
+        mount = get_arm(arm).mount
+        x, y, z = mount.position
+        self.declare_fields(MountParameters, mount_x=x, mount_y=y, mount_z=z,
+                            mount_turn=mount.yaw, tool_length=mount.tool)
 
     def camera_pose(self) -> np.ndarray:
         """
-        Return the pose (4, 4) of the camera, by the parameters of declare_camera.
+        Return the pose (4, 4) of the camera, by CameraParameters.
 
         :raises ConfigError: for a quaternion of length 0, and for numbers of no pose.
         """
@@ -151,8 +212,8 @@ class Parameters:
     def _check_choices(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse strings that are none of the choices."""
         for parameter in parameters:
-            choices = self._choices.get(parameter.name)
-            if choices is not None and parameter.value not in choices:
+            choices = self._choices.get(parameter.name, (parameter.value,))
+            if parameter.value not in choices:
                 return SetParametersResult(
                     successful=False,
                     reason=f'{parameter.name} is {parameter.value!r}; '

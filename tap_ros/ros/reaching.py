@@ -4,7 +4,6 @@
 
 from collections.abc import Callable, Iterator
 from concurrent import futures
-from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 import secrets
@@ -21,16 +20,14 @@ from rclpy.node import Node
 from rclpy.task import Future
 from tap_msgs.action import ReachGoal
 from tap_ros.base.contract import NODE_CLASSES
-from tap_ros.ros.calls import call, CallError, POLL_S, wait_for_answer
+from tap_ros.ros.calls import call, CallError, log_error, POLL_S, wait_for_answer
 from tap_ros.ros.heartbeat import Liveness, Presence, publishers_present
-from tap_ros.ros.services import log_error
-from tap_ros.ros.subscriptions import UNKNOWN
+from tap_ros.ros.subscriptions import PROCESS_BYTES, processes, UNKNOWN
 
 ACTION = 'reach_goal'
 STATUS, FEEDBACK = f'{ACTION}/_action/status', f'{ACTION}/_action/feedback'
 CANCEL = f'{ACTION}/_action/cancel_goal'
 CLIENT = 'tap_ros_client_'  # begins the name of a Client's own node
-SENDER_BYTES = 12  # of a goal's id: of its sender's process
 ANSWER_S = 5.0  # until an answer to a goal is held to be lost, and the goal is sent anew
 CANCEL_S = 1.0  # until a cancel that is not answered is sent again
 CLOSE_S = 5.0  # that cancelling may take when a client ends: more than a dead planner's lease
@@ -42,8 +39,7 @@ class Goals:
     """
     The goals that a node has sent: none is left without an owner.
 
-    What is given up is cancelled by its id, again and again until the planner has answered, in a
-    thread of its own. All that have not ended are given up by close.
+    A thread cancels by its id what was given up, again and again until the planner has answered.
 
     :param node: rclpy Node that another thread spins.
     :param server: Liveness of the planner.
@@ -52,16 +48,12 @@ class Goals:
 
     def __init__(self, node: Node, server: Liveness, group: CallbackGroup,
                  answers: CallbackGroup) -> None:
-        self.node, self.server = node, server
-        self._group = group
+        self.node, self.server, self._group = node, server, group
         self.renew()
-        self._cancels = node.create_client(CancelGoal, CANCEL, callback_group=answers)
-        self._changed = threading.Condition()
-        self._open: set[Reaching] = set()
-        self._unwanted: set[Reaching] = set()
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name='cancelling', daemon=True)
-        self._thread.start()
+        self.cancels = node.create_client(CancelGoal, CANCEL, callback_group=answers)
+        self.open: set[Reaching] = set()  # that have not ended
+        self.given_up, self.closed = threading.Event(), threading.Event()
+        threading.Thread(target=self._cancel, name='cancelling', daemon=True).start()
 
     def renew(self) -> None:
         """
@@ -71,73 +63,35 @@ class Goals:
         """
         self.action = ActionClient(self.node, ReachGoal, ACTION, callback_group=self._group)
 
-    @property
-    def planner_there(self) -> bool:
-        """Whether a planner is in the ROS graph."""
-        return bool(self._cancels.service_is_ready())
-
     def new_id(self) -> Any:
         """Return the id of a goal; the planner watches whom its first bytes name."""
-        own = {one for one, *name in _listeners(self.node)
-               if name == [self.node.get_name(), self.node.get_namespace()]}
-        sender = own.pop() if len(own) == 1 else secrets.token_bytes(SENDER_BYTES)
+        own = [process for process, names in _listeners(self.node).items()
+               if self.node.get_fully_qualified_name() in names]
+        sender = own[0] if len(own) == 1 else secrets.token_bytes(PROCESS_BYTES)
         goal_id = GoalInfo().goal_id
-        goal_id.uuid = list(sender + secrets.token_bytes(16 - SENDER_BYTES))
+        goal_id.uuid = list(sender + secrets.token_bytes(16 - PROCESS_BYTES))
         return goal_id
-
-    def add(self, goal: 'Reaching') -> None:
-        """Become the owner of a goal that is about to be sent."""
-        with self._changed:
-            if self._closed.is_set():
-                raise CallError(f'action {ACTION}: the client was closed')
-            self._open.add(goal)
-
-    def ended(self, goal: 'Reaching') -> None:
-        """Forget a goal that has ended, or was never sent."""
-        with self._changed:
-            self._open.discard(goal)
-            self._unwanted.discard(goal)
-            self._changed.notify_all()
-
-    def unwanted(self, goal: 'Reaching') -> None:
-        """Cancel a goal until the planner has answered."""
-        with self._changed:
-            self._unwanted |= {goal} & self._open
-            self._changed.notify_all()
 
     def close(self) -> None:
         """Cancel what has not ended; wait until that was answered or the planner is gone."""
-        with self._changed:
-            goals = list(self._open)
-        for goal in goals:
+        for goal in list(self.open):
             goal.cancel()
         deadline = time.monotonic() + CLOSE_S
-        while time.monotonic() < deadline and self.node.context.ok():
-            with self._changed:
-                if all(goal.planner_gone for goal in self._unwanted):
-                    break
-                self._changed.wait(POLL_S)
-        self._closed.set()
-        with self._changed:
-            self._changed.notify_all()
-        self._thread.join(1.0)
+        while time.monotonic() < deadline and self.node.context.ok() and not all(
+                goal.planner_gone for goal in list(self.open)):
+            time.sleep(POLL_S)
+        self.closed.set()
+        self.given_up.set()
 
-    def _run(self) -> None:
-        while not self._closed.is_set():
-            with self._changed:
-                self._changed.wait_for(lambda: self._unwanted or self._closed.is_set())
-                goals = list(self._unwanted)
-            for goal in goals:
-                if self.try_cancel(goal):
-                    self.ended(goal)
-            self._closed.wait(POLL_S)
-
-    def try_cancel(self, goal: 'Reaching') -> bool:
-        """Ask once for the end of a goal; return whether nobody can pursue it any more."""
-        with suppress(Exception):  # whatever it is, one asks until it is answered
-            return goal.is_cancelled_by(lambda request: call(
-                self._cancels, request, CANCEL_S, self._closed.is_set))
-        return False
+    def _cancel(self) -> None:
+        while not self.closed.wait(POLL_S):
+            self.given_up.wait()
+            self.given_up.clear()
+            for goal in [one for one in list(self.open) if one.given_up]:
+                if goal.is_cancelled():
+                    self.open.discard(goal)
+                else:
+                    self.given_up.set()
 
 
 @dataclass(frozen=True)
@@ -185,11 +139,13 @@ class Reaching:
         self._take = on_feedback or self._feedback.put
         self._id = goals.new_id()
         self._lock = threading.Lock()  # nothing is sent after it was given up
-        self._given_up = self._sent_anew = False
+        self.given_up = self._sent_anew = False
         self._accepted: Future | None = None  # once it was sent
         self._answer: Future | None = None
         self._presence: Presence | None = None  # of the planner that it was sent to
-        goals.add(self)
+        if goals.closed.is_set():
+            raise CallError(f'{self._name}: the client was closed')
+        goals.open.add(self)
         try:
             self._begin(goal, min(accept_s, timeout_s))
         except BaseException:  # an interrupt, too
@@ -211,12 +167,10 @@ class Reaching:
     def cancel(self) -> None:
         """Have the goal cancelled, until the planner has answered; result tells the end."""
         with self._lock:
-            self._given_up = True
-            sent = self._accepted is not None
-        if sent:
-            self._goals.unwanted(self)
-        else:
-            self._goals.ended(self)
+            self.given_up = True
+        if self._accepted is None:  # it was never sent
+            self._goals.open.discard(self)
+        self._goals.given_up.set()
 
     def result(self) -> ReachResult:
         """
@@ -247,19 +201,18 @@ class Reaching:
     @property
     def planner_gone(self) -> bool:
         """Whether the planner that it was sent to has left the ROS graph."""
-        return not self._goals.planner_there or (
+        return not self._goals.cancels.service_is_ready() or (
             self._presence is not None and self._presence.gone)
 
-    def is_cancelled_by(self, ask: Callable[[CancelGoal.Request], CancelGoal.Response]) -> bool:
-        """
-        Ask once for the end of the goal; return whether nobody can pursue it any more.
-
-        :param ask: sends the request, and returns the answer.
-        :raises CallError: without an answer.
-        """
-        accepted = self._accepted
+    def is_cancelled(self) -> bool:
+        """Ask once for the end of the goal; return whether nobody can pursue it any more."""
+        accepted, request = self._accepted, CancelGoal.Request(
+            goal_info=GoalInfo(goal_id=self._id))
         answered = accepted is not None and accepted.done()  # before this asks
-        answer = ask(CancelGoal.Request(goal_info=GoalInfo(goal_id=self._id)))
+        try:
+            answer = call(self._goals.cancels, request, CANCEL_S, self._goals.closed.is_set)
+        except Exception:  # whatever it is, one asks until it is answered
+            return False
         if answer.return_code == CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID:
             # A cancel may overtake its goal; a new planner knows no goal of the one before.
             return answered or self.planner_gone
@@ -277,12 +230,12 @@ class Reaching:
         self._presence = publishers_present(self._goals.node, STATUS)
         while not (accepted := self._sent(goal, deadline, accept_s)).accepted:
             if not self._sent_anew or time.monotonic() >= deadline:
-                self._goals.ended(self)
+                self._goals.open.discard(self)
                 raise CallError(f'{self._name}: the goal was rejected; the log of '
                                 f'{self._server.name} says why')
             time.sleep(CANCEL_S)  # the one whose answer was lost has yet to end
         self._answer = self._in_executor(accepted.get_result_async, deadline)
-        self._answer.add_done_callback(lambda _: self._goals.ended(self))
+        self._answer.add_done_callback(lambda _: self._goals.open.discard(self))
 
     def _sent(self, goal: ReachGoal.Goal, deadline: float, accept_s: float) -> ClientGoalHandle:
         """
@@ -299,7 +252,7 @@ class Reaching:
                     f'{server.name} has left the ROS graph before it answered',
                     lambda: self.planner_gone):
                 return answer.result()
-            while time.monotonic() < deadline and not self._goals.try_cancel(self):
+            while time.monotonic() < deadline and not self.is_cancelled():
                 time.sleep(POLL_S)
             if time.monotonic() >= deadline:
                 raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; '
@@ -327,7 +280,7 @@ class Reaching:
                 self.cancel()
 
         with self._lock:
-            if self._given_up:
+            if self.given_up:
                 raise CallError(f'{self._name}: given up')
             self._accepted = self._goals.action.send_goal_async(goal, take, goal_id)
             return self._accepted
@@ -374,18 +327,19 @@ def watch_sender(node: Node, goal_id: bytes) -> Callable[[], bool]:
     :param node: that serves the goal; goal_id: its 16 bytes.
     """
     def there() -> set[bytes]:
-        return {one for one, *_ in _listeners(node)}
+        return {*_listeners(node)}
 
     def strangers() -> set[bytes]:
-        return {one for one, name, _ in _listeners(node)
-                if name not in {UNKNOWN, *NODE_CLASSES} and not name.startswith(CLIENT)}
+        return {process for process, names in _listeners(node).items()
+                if any(name not in {UNKNOWN, *NODE_CLASSES} and not name.startswith(CLIENT)
+                       for name in (full.rpartition('/')[2] for full in names))}
 
-    sender = Presence(lambda: there() & {goal_id[:SENDER_BYTES]})
+    sender = Presence(lambda: there() & {goal_id[:PROCESS_BYTES]})
     others, listeners = Presence(strangers), Presence(there)
     return lambda: sender.gone or (not sender.there and (others.gone or listeners.gone))
 
 
-def _listeners(node: Node) -> list[tuple[bytes, str, str]]:
-    """Return process, name and namespace of those that take feedback, as clients do."""
-    return [(bytes(info.endpoint_gid[:SENDER_BYTES]), info.node_name, info.node_namespace)
-            for info in node.get_subscriptions_info_by_topic(node.resolve_topic_name(FEEDBACK))]
+def _listeners(node: Node) -> dict[bytes, set[str]]:
+    """Return the processes and nodes that take feedback, as those do who have sent a goal."""
+    return processes(
+        node.get_subscriptions_info_by_topic(node.resolve_topic_name(FEEDBACK)))

@@ -14,14 +14,12 @@ from typing import Any
 
 import rclpy
 from rclpy import executors
-from rclpy.exceptions import InvalidHandle
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from tap_ros.base.contract import NODE_CLASSES
 from tap_ros.base.errors import TapError
 from tap_ros.base.text import escaped, listing
+from tap_ros.ros.calls import log_error, spin_once
 from tap_ros.ros.heartbeat import Heartbeat
-from tap_ros.ros.services import log_error
 
 SUBNET = Path(__file__).with_name('fastdds_subnet.xml')
 LOCALHOST = Path(__file__).with_name('fastdds_localhost.xml')
@@ -69,7 +67,7 @@ def main(name: str = '', args: list[str] | None = None) -> int:
         _handle_signals(end)
         configure_fast_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = node_class()
+        node = node_class(automatically_declare_parameters_from_overrides=True)
         warn_of_unknown_parameters(node)
         _handle_signals(lambda *_: stop.set())
         num_threads = getattr(node_class, 'num_threads', 1)
@@ -78,7 +76,7 @@ def main(name: str = '', args: list[str] | None = None) -> int:
         executor.add_node(node)
         heartbeat = Heartbeat(node)
         while rclpy.ok() and not stop.is_set():
-            _spin_once(executor, node)
+            spin_once(executor, node)
     except (_Ended, KeyboardInterrupt, executors.ExternalShutdownException):
         pass
     except (TapError, RuntimeError) as error:
@@ -93,7 +91,11 @@ def main(name: str = '', args: list[str] | None = None) -> int:
     finally:
         _handle_signals(lambda *_: None)  # it is ending already
         if node is not None:
-            code = _close(node) or code  # first of all: it stops the arm
+            try:
+                code = node.close() or code  # first of all: it stops the arm
+            except Exception as error:
+                log_error(node, 'the node did not end cleanly', error)
+                code = 1
         if heartbeat is not None:
             heartbeat.end()
         if executor is not None:
@@ -104,10 +106,10 @@ def main(name: str = '', args: list[str] | None = None) -> int:
     return code
 
 
-def warn_of_unknown_parameters(node: Node) -> None:
+def warn_of_unknown_parameters(node: Any) -> None:
     """Warn of parameters that were given to a node and that it does not have."""
-    known = list(node._parameters)
-    for name in sorted(set(node._parameter_overrides) - set(known)):
+    known = list(node.list_parameters([], 0).names)
+    for name in sorted(node.params.given - set(known)):
         near = get_close_matches(name, known, 1) or known
         node.get_logger().warning(
             f'parameter {escaped(name)} is unknown to this node and has no effect; '
@@ -151,24 +153,3 @@ def _handle_signals(handler: Callable[[int, Any], Any]) -> None:
         signal.signal(number, handler)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
         signal.signal(signal.SIGHUP, handler)
-
-
-def _spin_once(executor: executors.Executor, node: Node) -> None:
-    """Run what is ready; a signal is noticed after 0.1 s at most."""
-    try:
-        executor.spin_once(timeout_sec=0.1)
-    except (KeyboardInterrupt, executors.ExternalShutdownException):
-        raise
-    except InvalidHandle:  # of what another thread destroyed just now
-        pass
-    except Exception as error:
-        log_error(node, 'a callback failed; the node goes on', error)
-
-
-def _close(node: Any) -> int:
-    """Let the node end what it does; return its exit code."""
-    try:
-        return node.close() or 0
-    except Exception as error:
-        log_error(node, 'the node did not end cleanly', error)
-        return 1

@@ -18,6 +18,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from tap_ros.base.contract import NODE_CLASSES
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE_TYPE, TOPICS
@@ -25,21 +26,9 @@ from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE_TYPE, TOPICS
 OURS = NODE_CLASSES.keys() - {'sim_node'}  # nodes whose pictures are no camera's
 UNKNOWN = '_NODE_NAME_UNKNOWN_'  # of a publisher that was discovered before its node
 ADAPT_PERIOD = 0.5  # s between two comparisons with what is offered
+PROCESS_BYTES = 12  # of an endpoint's id, by which the endpoints of one process begin
 
-
-class PollOnlyGroup(CallbackGroup):
-    """Callback group that wakes no executor: messages wait until they are taken."""
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return False: no callback is ever due."""
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Return False: no callback may begin."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing, since no callback has begun."""
+Publishers = Mapping[str, Mapping[bytes, set[str]]]  # of each topic: {process: its nodes}
 
 
 class AdaptiveSubscription:
@@ -84,18 +73,6 @@ class AdaptiveSubscription:
         self._node.destroy_subscription(self.subscription)
         self._subscribe()
 
-    def take(self, limit: int) -> list[tuple[Any, dict[str, Any]]]:
-        """Return messages, with their info, that wait for a callback; at most `limit`."""
-        taken: list[tuple[Any, dict[str, Any]]] = []
-        subscription = self.subscription
-        with subscription.handle:
-            while len(taken) < limit:
-                one = subscription.handle.take_message(subscription.msg_type, self._raw)
-                if one is None:
-                    break
-                taken.append(one)
-        return taken
-
     def why_silent(self) -> str:
         """Return why no message can arrive, and the remedy; '' if one can."""
         return why_silent(self._node, self.topic, self._type)
@@ -123,37 +100,30 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], object],
                              clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, dict[bytes, set[str]]]:
-    """Return {topic: {participant: nodes}} of topics of which there may be but one publisher."""
-    found: dict[str, dict[bytes, set[str]]] = {}
-    for topic in map(node.resolve_topic_name, topics):
-        publishers = found.setdefault(topic, {})
-        for info in node.get_publishers_info_by_topic(topic):
-            # The participant is known before all topics and nodes of it.
-            publishers.setdefault(bytes(info.endpoint_gid[:12]), set()).add(
-                f'{info.node_namespace.rstrip("/")}/{info.node_name}')
+def processes(infos: Iterable[TopicEndpointInfo]) -> dict[bytes, set[str]]:
+    """Return {process: full names of its nodes} of publishers or subscribers of a topic."""
+    found: dict[bytes, set[str]] = {}
+    for info in infos:  # the DDS participant is known before all topics and nodes of it
+        found.setdefault(bytes(info.endpoint_gid[:PROCESS_BYTES]), set()).add(
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}')
     return found
 
 
-def publishers_beside(node: Node, topic: str) -> list[str]:
-    """Return the full names of the nodes that publish on a topic beside this one, sorted."""
-    names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-             for info in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))]
-    own = node.get_fully_qualified_name()
-    if own in names:  # another one may have the same name
-        names.remove(own)
-    return sorted(names)
+def publishers_of(node: Node, *topics: str) -> dict[str, dict[bytes, set[str]]]:
+    """Return {full name of the topic: {process: full names of its nodes}}."""
+    return {topic: processes(node.get_publishers_info_by_topic(topic))
+            for topic in map(node.resolve_topic_name, topics)}
 
 
-def rivals(node: Node, topics: Iterable[str],
-           known: Mapping[str, Mapping[bytes, set[str]]] = MappingProxyType({})) -> str:
+def rivals(found: Publishers, known: Publishers = MappingProxyType({})) -> str:
     """
     Say who publish a topic where several do and one, such as a second camera, is new; else ''.
 
-    :param known: what publishers_of returned before; by default all are new.
+    :param found: what publishers_of returns, of topics of which there may be one publisher.
+    :param known: what it returned before; by default all are new.
     """
     before: set[bytes] = set().union(*known.values())
-    for topic, publishers in publishers_of(node, topics).items():
+    for topic, publishers in found.items():
         nodes = [name for names in publishers.values()
                  for name in {one for one in names if UNKNOWN not in one} or names]
         if len(nodes) > 1 and publishers.keys() - before:

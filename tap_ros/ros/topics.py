@@ -1,13 +1,26 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What several nodes share of topics: quality of service, message classes, stamps."""
+"""Topics as nodes use them: quality of service, message classes, messages made from fields."""
+
+import array
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib import import_module
+from typing import Any, ParamSpec, TypeVar
 
 from builtin_interfaces.msg import Time
+import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from tap_ros.messages import topics
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
+from tap_msgs.msg import ObjectStates, Subgoal
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.text import escaped
+from tap_ros.messages import images, joints, objects, subgoals, topics
 from tap_ros.messages.topics import Topic
 from tap_ros.ros.parameters import Parameters
-from tap_ros.ros.ros_messages import message_class
+
+P = ParamSpec('P')
+M = TypeVar('M')
 
 # Reliable and kept for late joiners: goals, the last subgoal.
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
@@ -31,7 +44,7 @@ def of_topic(topic: Topic) -> tuple[type, str]:
 def camera_image(parameters: Parameters) -> tuple[type, str]:
     """Return message class and name of the topic of the camera's pictures."""
     if parameters['image_transport'] == 'compressed':
-        return message_class(topics.COMPRESSED_TYPE), f'{topics.IMAGE.name}/compressed'
+        return CompressedImage, f'{topics.IMAGE.name}/compressed'
     return of_topic(topics.IMAGE)
 
 
@@ -43,21 +56,71 @@ def camera_topics(parameters: Parameters) -> dict[str, tuple[type, str]]:
     :return: {short name: (message class, topic name)}, the picture first; with the robot mask
         when one is used.
     """
-    return {'image': camera_image(parameters), 'objects': of_topic(topics.OBJECTS),
-            **_mask(topics.ROBOT_MASK, parameters['robot_mask'])}
+    mask = {'mask': of_topic(topics.ROBOT_MASK)} if parameters['robot_mask'] != 'none' else {}
+    return {'image': camera_image(parameters), 'objects': of_topic(topics.OBJECTS), **mask}
 
 
 def goal_topics(robot_mask: str) -> dict[str, tuple[type, str]]:
     """Return the same for the picture of a goal."""
-    return {'image': of_topic(topics.GOAL_IMAGE), 'objects': of_topic(topics.GOAL_OBJECTS),
-            **_mask(topics.GOAL_ROBOT_MASK, robot_mask)}
-
-
-def _mask(topic: Topic, robot_mask: str) -> dict[str, tuple[type, str]]:
-    return {'mask': of_topic(topic)} if robot_mask != 'none' else {}
+    mask = {'mask': of_topic(topics.GOAL_ROBOT_MASK)} if robot_mask != 'none' else {}
+    return {'image': of_topic(topics.GOAL_IMAGE), 'objects': of_topic(topics.GOAL_OBJECTS), **mask}
 
 
 def to_stamp(nanoseconds: int) -> Time:
     """Return builtin_interfaces/Time."""
     seconds, rest = divmod(int(nanoseconds), 10**9)
     return Time(sec=seconds, nanosec=rest)
+
+
+@cache
+def message_class(type_name: str) -> type[Any]:
+    """
+    Import the class of a message type.
+
+    :param type_name: for example 'sensor_msgs/msg/Image'.
+    :raises ConfigError: when its package is not installed.
+    """
+    try:
+        package, _, name = type_name.split('/')
+        return getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f'message type {escaped(type_name)} is not installed; source the workspace that has it'
+        ) from error
+
+
+def make_message(message_type: type[M], fields: Mapping[str, Any]) -> M:
+    """
+    Make a message.
+
+    :param message_type: its class.
+    :param fields: by name, nested; bytes are uint8 arrays. What is left out is as by default.
+    """
+    message = message_type()
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            value = make_message(type(getattr(message, name)), value)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            kind = message_type.get_fields_and_field_types()[name]  # type: ignore[attr-defined]
+            package, kind = kind.removeprefix('sequence<').removesuffix('>').split('/')
+            value = [make_message(message_class(f'{package}/msg/{kind}'), one) for one in value]
+        elif isinstance(value, np.ndarray):
+            # Any other type than array.array is checked byte by byte, which takes milliseconds.
+            value = array.array('B', value.tobytes())
+        setattr(message, name, value)
+    return message
+
+
+def _encoder(message_type: type[M], fields: Callable[P, dict[str, Any]]) -> Callable[P, M]:
+    """Return a function that makes a message of what `fields` returns."""
+    def encode(*args: P.args, **kwargs: P.kwargs) -> M:
+        return make_message(message_type, fields(*args, **kwargs))
+    return encode
+
+
+encode_image = _encoder(Image, images.image_fields)
+encode_mask = _encoder(Image, images.mask_fields)
+encode_camera_info = _encoder(CameraInfo, images.camera_info_fields)
+encode_joints = _encoder(JointState, joints.joint_fields)
+encode_objects = _encoder(ObjectStates, objects.objects_fields)
+encode_subgoal = _encoder(Subgoal, subgoals.subgoal_fields)

@@ -95,7 +95,7 @@ class Rig:
         return publishers_present(self.node, f'{name}/heartbeat')
 
     def _there(self, name):
-        return set(*publishers_of(self.node, [f'{name}/heartbeat']).values())
+        return set(*publishers_of(self.node, f'{name}/heartbeat').values())
 
     def remove(self, name):
         """End a node, politely first."""

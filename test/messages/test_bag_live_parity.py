@@ -29,8 +29,7 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import BagWriter
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
-from tap_ros.ros.ros_messages import encode_image, encode_mask, encode_objects
-from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.topics import encode_image, encode_mask, encode_objects, LATCHED, STREAM, to_stamp
 
 pytestmark = pytest.mark.ros
 MS = 10**6

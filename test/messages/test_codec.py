@@ -14,7 +14,7 @@ from tap_ros.base.errors import ImageError, PlanningError
 from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.messages import images, objects
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
-from tap_ros.ros import ros_messages
+from tap_ros.ros import topics as ros_topics
 from tap_ros.ros.topics import to_stamp
 
 pytestmark = pytest.mark.ros
@@ -33,7 +33,7 @@ def message_of(rows, encoding, width):
 
 
 def test_a_picture_survives_the_round_trip_and_rows_may_be_padded():
-    message = ros_messages.encode_image(picture(), STAMP, 'camera')
+    message = ros_topics.encode_image(picture(), STAMP, 'camera')
     assert (message.encoding, message.step, message.header.frame_id) == ('rgb8', 21, 'camera')
     assert message.header.stamp == STAMP
     assert np.array_equal(images.decode_image(message, 'start', (5, 7)), picture())
@@ -53,7 +53,7 @@ def test_a_picture_survives_the_round_trip_and_rows_may_be_padded():
     ({'height': 2**22, 'data': array.array('B', bytes(2**25 + 1))}, ['33554433', '33554432']),
 ])
 def test_a_bad_picture_is_refused_with_the_reason(change, words):
-    message = ros_messages.encode_image(picture(), STAMP, 'camera')
+    message = ros_topics.encode_image(picture(), STAMP, 'camera')
     for field, value in change.items():
         setattr(message, field, value)
     with pytest.raises(ImageError) as error:
@@ -62,12 +62,12 @@ def test_a_bad_picture_is_refused_with_the_reason(change, words):
         assert word in str(error.value)
     assert str(error.value).isprintable() and len(str(error.value)) < 400
     with pytest.raises(ImageError, match='expected 4x3 .* got 7x5'):
-        images.decode_image(ros_messages.encode_image(picture(), STAMP, ''), 'start', (3, 4))
+        images.decode_image(ros_topics.encode_image(picture(), STAMP, ''), 'start', (3, 4))
 
 
 def test_a_map_survives_the_round_trip_in_either_byte_order_and_is_finite():
     values = np.random.default_rng(1).random((5, 7), np.float32)
-    message = ros_messages.encode_map(values, STAMP, 'camera')
+    message = ros_topics.make_message(Image, images.map_fields(values, STAMP, 'camera'))
     assert np.array_equal(images.decode_map(message, 'map'), values)
     message.data = array.array('B', values.astype('>f4').tobytes())
     message.is_bigendian = 1
@@ -75,14 +75,15 @@ def test_a_map_survives_the_round_trip_in_either_byte_order_and_is_finite():
     for value in (np.nan, np.inf):
         values[2, 3] = value
         with pytest.raises(ImageError, match='map of red: .*finite'):
-            images.decode_map(ros_messages.encode_map(values, STAMP, 'camera'), 'map of red')
+            images.decode_map(ros_topics.make_message(
+                Image, images.map_fields(values, STAMP, 'camera')), 'map of red')
     with pytest.raises(ImageError, match='32FC1'):
-        images.decode_map(ros_messages.encode_image(picture(), STAMP, ''), 'map')
+        images.decode_map(ros_topics.encode_image(picture(), STAMP, ''), 'map')
 
 
 def some_objects(pixels, names=('red', 'blue')):
     poses = np.arange(7 * len(names)).reshape(-1, 7)
-    return ros_messages.encode_objects(
+    return ros_topics.encode_objects(
         names, pixels, poses, STAMP, 'world', ObjectStates.SOURCE_TRACKED)
 
 
@@ -153,7 +154,7 @@ def subgoal(sample, level):
 def answer(subgoals, names=NAMES):
     return PredictSubgoal.Response(
         success=True, subgoals=[
-            ros_messages.encode_subgoal(s, names, to_stamp(1), 'eye') for s in subgoals],
+            ros_topics.encode_subgoal(s, names, to_stamp(1), 'eye') for s in subgoals],
         sample=[s.sample for s in subgoals], level=[s.level for s in subgoals])
 
 
@@ -169,7 +170,7 @@ def test_what_was_encoded_is_decoded_in_the_order_asked_for():
 
 
 def test_a_subgoal_carries_the_stamp_and_frame_of_the_picture_and_may_have_no_objects():
-    message = ros_messages.encode_subgoal(subgoal(0, 1), NAMES, to_stamp(5), 'eye')
+    message = ros_topics.encode_subgoal(subgoal(0, 1), NAMES, to_stamp(5), 'eye')
     for part in (message, message.image, *message.object_maps):
         assert part.header.stamp == to_stamp(5) and part.header.frame_id == 'eye'
     decoded, = decode_subgoals(answer([subgoal(2, 1)]), NAMES[:1], SIZE)

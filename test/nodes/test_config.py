@@ -27,9 +27,10 @@ def declared(name, *arguments):
     context.init(args=['--ros-args', *arguments])
     node = Node(name, context=context)
     try:
-        before = set(node._parameters)
+        before = set(node.list_parameters([], 0).names)
         import_module(NODE_CLASSES[name].split(':')[0]).declare_parameters(node)
-        return {key: node.get_parameter(key).value for key in set(node._parameters) - before}
+        return {key: node.get_parameter(key).value
+                for key in set(node.list_parameters([], 0).names) - before}
     finally:
         node.destroy_node()
         context.try_shutdown()

@@ -22,8 +22,7 @@ from tap_ros.apps.server import is_loopback
 from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.base.errors import ConfigError
 from tap_ros.ros.calls import CallError
-from tap_ros.ros.ros_messages import encode_image, encode_objects
-from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.topics import encode_image, encode_objects, LATCHED, STREAM, to_stamp
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

@@ -3,7 +3,6 @@
 """Laws of putting messages together by their stamp."""
 
 from itertools import product
-from math import inf
 import threading
 import time
 
@@ -16,8 +15,8 @@ from sensor_msgs.msg import CompressedImage, Image, JointState
 from tap_msgs.msg import ObjectStates
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
-from tap_ros.ros.ros_messages import encode_objects
-from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.polling import PollOnlyGroup
+from tap_ros.ros.topics import encode_objects, LATCHED, STREAM, to_stamp
 
 
 def stamped(kind, nanoseconds):
@@ -122,7 +121,7 @@ def test_what_repeats_a_stamp_is_as_old_as_the_first_unless_a_clock_says_that_ti
     for stray in range(100, 100 + 3 * DEPTH):
         seen.put('joints', stamped(Image, stray), 3.6)
     receive(10, 3.7)  # long forgotten by its stamp
-    assert seen.ages(('image', 'other'), 4.0) == {'image': 3.0, 'other': inf}
+    assert seen.ages(('image',), 4.0) == {'image': 3.0}
     seen.on_clock(Clock(clock=to_stamp(10)))
     receive(10, 3.9)
     assert seen.newest('image', since=3.8).received == 3.9
@@ -147,7 +146,7 @@ def test_topics_are_put_together_as_they_come_or_on_demand(client):
     seen, told = Observations('image', 'joints'), []
     seen.subscribe(client, types, STREAM, on_message=told.append)
     asked, taken = Observations('image', 'joints'), []
-    asked.subscribe(client, types, STREAM, on_message=taken.append, on_demand=True)
+    asked.subscribe(client, types, STREAM, PollOnlyGroup(), taken.append)
     publishers = [client.create_publisher(kind, name, STREAM) for kind, name in types.values()]
     begun = time.monotonic()
     for stamp in range(1, 600):
@@ -184,15 +183,15 @@ def objects(stamp, u=3.0, v=8.0):
                           ObjectStates.SOURCE_TRACKED)
 
 
-@pytest.mark.parametrize('on_demand', [False, True])
-def test_best_effort_and_volatile_publishers_are_heard(client, on_demand):
+@pytest.mark.parametrize('group', [None, PollOnlyGroup()])
+def test_best_effort_and_volatile_publishers_are_heard(client, group):
     heard = []
     camera, goal = Observations('image'), Observations('image', 'objects', latched=True)
     for seen, types, qos in (
             (camera, {'image': (CompressedImage, 'camera/image_raw/compressed')}, STREAM),
             (goal, {'image': (CompressedImage, 'goal/image/compressed'),
                     'objects': (ObjectStates, 'goal/objects')}, LATCHED)):
-        seen.subscribe(client, types, qos, on_message=heard.append, on_demand=on_demand)
+        seen.subscribe(client, types, qos, group, heard.append)
     with Client('camera') as node:
         volatile = QoSProfile(depth=1)  # of a goal, as `ros2 topic pub` has it
         sends = [(node.create_publisher(type(message), topic, qos), message)
@@ -213,9 +212,9 @@ def test_what_was_latched_before_does_not_come_back(client):
     kept = client.create_publisher(ObjectStates, 'goal/objects', LATCHED)
     kept.publish(objects(3 * 10**9, 3.0))
     asked, observed = (Observations('objects', latched=True) for _ in range(2))
-    for observations, on_demand in ((asked, True), (observed, False)):
-        observations.subscribe(client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED,
-                               on_demand=on_demand)
+    for observations, group in ((asked, PollOnlyGroup()), (observed, None)):
+        observations.subscribe(
+            client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED, group)
 
     def newest():
         found = [each.newest('objects') for each in (asked, observed)]

@@ -14,8 +14,7 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.messages.images import decode_image
 from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.ros.calls import call
-from tap_ros.ros.ros_messages import encode_image, encode_objects
-from tap_ros.ros.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
+from tap_ros.ros.topics import encode_image, encode_objects, LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights.weights import save_weights, stored_digest
 
 NAMES = ('cup', 'box')

@@ -20,8 +20,7 @@ from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.robots.arm import Mount
 from tap_ros.robots.ur10e import UR10E
 from tap_ros.ros.calls import call
-from tap_ros.ros.ros_messages import encode_image
-from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.topics import encode_image, LATCHED, STREAM, to_stamp
 
 
 def read(folder):

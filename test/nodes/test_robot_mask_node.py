@@ -17,8 +17,7 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.robot_mask.node import RobotMaskNode
 from tap_ros.robots.ur10e import UR10E
 from tap_ros.ros.robot_view import RobotView
-from tap_ros.ros.ros_messages import encode_camera_info, encode_image
-from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.topics import encode_camera_info, encode_image, LATCHED, STREAM, to_stamp
 
 CAMERA = {  # of the simulator with its arm: 0.84 rad from straight down
     'camera_y': -1.36, 'camera_z': 1.33,

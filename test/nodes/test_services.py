@@ -8,7 +8,7 @@ from processes import LocalNode, until
 from rclpy.node import Node
 from std_srvs.srv import SetBool
 import tap_ros
-from tap_ros.ros.services import DeferredService
+from tap_ros.ros.polling import DeferredService
 from tap_ros.ros.topics import SERVICE_QOS
 
 

@@ -22,9 +22,15 @@ from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.tracker.node import TrackerNode
 from tap_ros.ros.calls import CallError
-from tap_ros.ros.client import positions_of
-from tap_ros.ros.ros_messages import encode_camera_info, encode_image, encode_joints
-from tap_ros.ros.topics import LATCHED, STREAM, to_stamp
+from tap_ros.ros.topics import (
+    encode_camera_info,
+    encode_image,
+    encode_joints,
+    LATCHED,
+    STREAM,
+    to_stamp,
+)
+from tap_ros.ros.views import positions_of
 from websockets.sync.client import connect
 
 SIZE = 128
@@ -166,10 +172,10 @@ class Eye:
 
     def begin(self, second):
         """Mark the begin of an episode, and wait until it is known."""
-        mark, before = Episode(event=Episode.START), self.node.node._begun
+        mark, before = Episode(event=Episode.START), self.node.node._inputs.episode
         mark.header.stamp = to_stamp(second * 10**9)
         self.send('episode', mark)
-        assert until(lambda: self.node.node._begun != before)
+        assert until(lambda: self.node.node._inputs.episode != before)
 
     def calibrate(self, place=(0.0, -1.1, 1.3), turn=(0.94, 0.0, 0.0, -0.34), focal=140.0):
         """Tell where the camera is, and how it sees."""
@@ -181,12 +187,12 @@ class Eye:
             for axis, value in zip('xyzw', values):
                 setattr(field, axis, value)
         self.send('camera/pose', pose, LATCHED)
-        node = self.node.node
-        assert until(lambda: repr(node._told) == repr(pose) and node._info is not None)
+        inputs = self.node.node._inputs
+        assert until(lambda: repr(inputs.pose) == repr(pose) and inputs.info is not None)
 
     def ask(self, **fields):
         """Call select_objects once a picture has come; return why it refuses, else ''."""
-        assert until(lambda: self.node.node._sensors.newest('image'))
+        assert until(lambda: self.node.node._inputs.sensors.newest('image'))
         with tap_ros.Client(f'/{self.name}') as user:
             try:
                 user.call('select', **fields)
@@ -334,7 +340,7 @@ def test_what_is_searched_in_a_goal_is_not_told_if_a_scene_begins_meanwhile(clie
 
         def slow(view):
             searching.set()
-            until(lambda: eye.node.node._begun[0] == 5 * 10**9, 5)
+            until(lambda: eye.node.node._inputs.episode[0] == 5 * 10**9, 5)
             return find(view)
 
         tracker.find = slow

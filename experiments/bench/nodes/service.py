@@ -32,7 +32,8 @@ from tap_ros.nodes.predictor.requests import MAX_TOGETHER as TOGETHER
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.protocol import Request
 from tap_ros.ros.calls import call, CallError
-from tap_ros.ros.client import Client, request_fields
+from tap_ros.ros.client import Client
+from tap_ros.ros.requests import request_fields
 from tap_ros.ros.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights import DEFAULT_PREDICTOR
 
@@ -118,7 +119,7 @@ def run(args):
 def compare_latency(stream, rounds, calls):
     """Time the model alone and the service in turns, so many calls in a turn."""
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
-    request = Request(*pictures(), *PIXELS)
+    alike = Request(*pictures(), *PIXELS)
     alone, together, service, inside = [], [], [], []
     with Client() as client:
         ask, request = make_client(client, SERVICE_QOS.depth), make_request()
@@ -127,8 +128,8 @@ def compare_latency(stream, rounds, calls):
         call(ask, request, 120)
         for _ in range(rounds):
             os.kill(stream.pid, signal.SIGSTOP)
-            alone += timed(lambda: predictor.predict_together([request]), calls)
-            together += timed(lambda: predictor.predict_together([request] * TOGETHER),
+            alone += timed(lambda: predictor.predict_together([alike]), calls)
+            together += timed(lambda: predictor.predict_together([alike] * TOGETHER),
                               -(-calls // TOGETHER))
             os.kill(stream.pid, signal.SIGCONT)
             service += timed(lambda: inside.append(

@@ -42,7 +42,8 @@ from tap_ros.base.files import free_folder, write_atomically, write_rows
 from tap_ros.base.options import Folder, one_of
 from tap_ros.base.plugins import load_plugin, names
 from tap_ros.robots.arm import DEFAULT_ARM
-from tap_ros.ros.client import Client, positions_of
+from tap_ros.ros.client import Client
+from tap_ros.ros.views import positions_of
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tyro import conf
 

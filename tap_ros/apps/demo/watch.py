@@ -22,9 +22,10 @@ from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.ros.calls import CallError
-from tap_ros.ros.client import Client, positions_of, View
+from tap_ros.ros.client import Client
 from tap_ros.ros.reaching import ReachResult
 from tap_ros.ros.topics import LATCHED
+from tap_ros.ros.views import positions_of, View
 from tap_ros.tracking.protocols import LOST
 
 # Nothing is lost while this process, which also draws films, is held up.

@@ -17,11 +17,10 @@ from tap_ros.apps.explorer.display import Display, GoalByHand, simulated
 from tap_ros.base.errors import TapError
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
-from tap_ros.ros.calls import CallError
+from tap_ros.ros.calls import CallError, reason
 from tap_ros.ros.client import Client
 from tap_ros.ros.heartbeat import Presence, publishers_present
 from tap_ros.ros.reaching import Reaching, STATUS
-from tap_ros.ros.services import reason
 from tap_ros.weights import PREDICTORS
 
 TIMEOUT_S = 20.0  # of a service

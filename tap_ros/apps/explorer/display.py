@@ -25,8 +25,7 @@ from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.ros.calls import CallError
-from tap_ros.ros.ros_messages import encode_objects
-from tap_ros.ros.topics import LATCHED
+from tap_ros.ros.topics import encode_objects, LATCHED
 from tap_ros.tracking.protocols import SEEN
 
 SILENT_S = 2.0  # after which the page says that a topic is silent

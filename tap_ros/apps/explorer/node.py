@@ -182,7 +182,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare(
         'host', '127.0.0.1', 'Address at which browsers find the page. One that is not of this '
         'machine alone, such as 0.0.0.0, needs a token.')
-    parameters.declare('port', 8000, 'Port of the page; 0: any that is free.', low=0, high=65535)
+    parameters.declare('port', 8000, 'Port of the page; 0: any that is free.', between=(0, 65535))
     parameters.declare(
         'token', '', 'That browsers must give as ?token=...; empty: none is needed where host is '
         'of this machine alone, else one is made up and printed.')

@@ -121,7 +121,7 @@ class ArmCommander:
         self._twist.wait_for_all_acked(Duration(seconds=seconds))
 
     def _watch(self) -> None:
-        """Stop the arm whenever it is due, until close."""
+        """Stop the arm when the last command or a sensor is too old, until close."""
         while not self._closed:
             with self._lock:
                 if self._goal is None:
@@ -129,7 +129,11 @@ class ArmCommander:
                     continue
                 self._tick()
                 try:
-                    self._stop_if_due(time.monotonic())
+                    now = time.monotonic()
+                    if now - self._stopped_at >= REPEAT_S and (
+                            now - self._moved_at > self._params['max_silence']
+                            or self._silent(self._topics, now)):
+                        self._stop()
                 except Exception as error:  # this thread must not end
                     self._node.get_logger().error(
                         f'the watch of the arm failed: {type(error).__name__}: {escaped(error)}',
@@ -142,13 +146,6 @@ class ArmCommander:
         if now - self._ticked_at > STOOD_S:
             self._stood_s = now - self._ticked_at
         self._ticked_at = now
-
-    def _stop_if_due(self, now: float) -> None:
-        """Stop the arm if the last command or a sensor is too old, and again after REPEAT_S."""
-        if now - self._stopped_at >= REPEAT_S and (
-                now - self._moved_at > self._params['max_silence']
-                or self._silent(self._topics, now)):
-            self._stop()
 
     def _silent(self, topics: Collection[str], now: float) -> bool:
         """Return whether one of the topics is silent."""

@@ -21,36 +21,33 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused
 from tap_ros.base.errors import ConfigError, PlanningError, TapError
 from tap_ros.base.text import escaped, listing
-from tap_ros.messages.objects import check_found, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES, TWIST
 from tap_ros.nodes.planner import settings
 from tap_ros.nodes.planner.arm import ArmCommander
-from tap_ros.nodes.planner.goals import ask_subgoals, GoalSource
+from tap_ros.nodes.planner.goals import GoalSource
 from tap_ros.nodes.planner.plan_view import draw_plan
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import declare_parameters
-from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
-from tap_ros.planning.reach import Command, End, Observation, Reach, SelectTargets
-from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
-from tap_ros.ros.calls import CallError
+from tap_ros.planning.reach import Command, End, Reach, SelectTargets
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.ros.calls import reason
 from tap_ros.ros.client import Client
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.lifecycle import LifecycleBase
 from tap_ros.ros.reaching import watch_sender
 from tap_ros.ros.robot_view import warn_if_unlike
-from tap_ros.ros.ros_messages import encode_image
-from tap_ros.ros.services import reason
-from tap_ros.ros.subscriptions import publishers_beside, steady_timer
-from tap_ros.ros.topics import camera_topics, goal_topics, STREAM, to_stamp
+from tap_ros.ros.subscriptions import publishers_of, steady_timer
+from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, STREAM, to_stamp
 
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'
+CANCELLED = 'cancelled'
 DESERTED = 'the client that sent the goal has left the ROS graph'
 WATCH_S = 0.2  # s between two looks at whether the client of a goal is still there
 GONE_S = 4.0  # s after which a node that was killed has left the ROS graph
+KNOWN_S = 1.0  # s after which rclpy knows of a cancel that _on_cancel was told of
 RESULT_S = 60  # s that a result, and the pictures of its request, are kept for who asks for it
 
 
@@ -73,29 +70,28 @@ class VisualMpcNode(LifecycleBase):
         super().__init__('visual_mpc_node', **options)
         self.params = declare_parameters(self)
         self._halt = ''  # why no goal may go on
-        self._cancelled: ServerGoalHandle | None = None  # the goal that was cancelled last
-        self._deserted: ServerGoalHandle | None = None  # the goal whose client was lost last
+        self._ended: tuple[ServerGoalHandle | None, str] = None, ''  # that has to end, and why
         self._sender_gone: tuple[ServerGoalHandle, Callable[[], bool]] | None = None
         self._busy = threading.Lock()  # held while a goal is executed
         self._refusals: deque[tuple[int, str]] = deque(maxlen=10)
         # Plans in one thread: each that has planned keeps 70 MB of its own, by malloc's arenas.
         self._worker = ThreadPoolExecutor(1, 'planning')
         self.autostart('configure')
-        robot_mask = self.params['robot_mask']
         self._diagnostics = Diagnostics(
             self, [JOINT_STATES.name, *(name for _, name in camera_topics(self.params).values())],
-            [name for _, name in goal_topics(robot_mask).values()], idle=self.why_not)
-        received = self._diagnostics.received
-        self._inputs = PlannerInputs(self, self.params, lambda: self._model.camera_crop, received)
-        self._goal = GoalSource(self, self._inputs.robot, received)
+            [name for _, name in goal_topics(self.params['robot_mask']).values()],
+            idle=self.why_not)
+        self._inputs = PlannerInputs(
+            self, self.params, lambda: self._model.camera_crop, self._diagnostics.received)
         self._sensors = self._inputs.sensors
+        client = Client(node=self)
+        client.find('predict')  # by the time of the first goal
+        self._goal = GoalSource(self, self.params, self._inputs, client, self._diagnostics)
         self._arm = ArmCommander(self, self.params, self._sensors)
         self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM)
         self._overlay = self.create_publisher(Image, 'plan/overlay', STREAM)
         self._distance = self.create_publisher(Float64, 'plan/distance', STREAM)
         group = ReentrantCallbackGroup()  # answers and cancels arrive while a goal is executed
-        self._client = Client(node=self)
-        self._client.is_ready('predict')  # it looks for the predictor, and hears its heart
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
             goal_callback=self._on_goal, cancel_callback=self._on_cancel,
@@ -106,7 +102,7 @@ class VisualMpcNode(LifecycleBase):
     def close(self) -> None:
         """End the goal in progress, and see that the command to stop has left."""
         self.active = False
-        self._end_goal(ENDING)
+        self._end_all(ENDING)
         self._arm.close(1.0)
         self._worker.shutdown(wait=False)
 
@@ -139,16 +135,16 @@ class VisualMpcNode(LifecycleBase):
 
     def pause(self) -> None:
         """Stop the arm at once, and let the goal in progress end."""
-        self._end_goal('the node was deactivated')
+        self._end_all('the node was deactivated')
 
     def _check_idle(self) -> None:
         """Raise PlanningError while the last goal has not ended: a plan may take its time."""
         if self._busy.locked():
             raise PlanningError('the last goal has not ended yet; try again')
 
-    def _end_goal(self, reason: str) -> None:
+    def _end_all(self, why: str) -> None:
         """Let no goal go on; wait for the one in progress."""
-        self._halt = reason
+        self._halt = why
         self._arm.end()
         self._sensors.wake()
         if self._busy.acquire(timeout=10.0):  # longer than a plan takes
@@ -168,18 +164,20 @@ class VisualMpcNode(LifecycleBase):
         return GoalResponse.ACCEPT
 
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        self._cancelled = handle  # its state is still executing
-        self._arm.end(handle)  # at once: a plan may be in progress
-        self._sensors.wake()
+        self._end(handle, CANCELLED)  # its state is still executing
         return CancelResponse.ACCEPT
 
     def _watch_sender(self) -> None:
-        """Stop the arm when nobody is left who could cancel the goal."""
+        """End the goal when nobody is left who could cancel it."""
         handle, gone = self._sender_gone or (None, None)
-        if gone is not None and self._deserted is not handle and gone():
-            self._deserted = handle
-            self._arm.end(handle)  # at once, as by a cancel
-            self._sensors.wake()
+        if gone is not None and self._ended[0] is not handle and gone():
+            self._end(handle, DESERTED)
+
+    def _end(self, handle: ServerGoalHandle | None, why: str) -> None:
+        """Let a goal not go on; the arm stops at once, as a plan may be in progress."""
+        self._ended = handle, why
+        self._arm.end(handle)
+        self._sensors.wake()
 
     def _on_refused(self, message: CommandRefused) -> None:
         self._refusals.append((to_nanoseconds(message.header.stamp), escaped(message.message)))
@@ -202,8 +200,11 @@ class VisualMpcNode(LifecycleBase):
             self._worker.submit(self._reach, handle, time.monotonic(), result).result()
             handle.succeed()
         except Cancelled as error:
-            result.message = str(error)
-            if self._is_cancelled(handle) and cancel_is_known(handle):
+            result.message, deadline = str(error), time.monotonic() + KNOWN_S
+            while self._why_end(handle) == CANCELLED and time.monotonic() < deadline and (
+                    not handle.is_cancel_requested):
+                time.sleep(0.01)
+            if handle.is_cancel_requested:
                 handle.canceled()
             else:
                 handle.abort()
@@ -225,34 +226,51 @@ class VisualMpcNode(LifecycleBase):
     def _expect_no_rival(self, handle: ServerGoalHandle) -> None:
         """Raise PlanningError if another node may command this arm."""
         deadline = time.monotonic() + GONE_S
-        while others := publishers_beside(self, TWIST.name):
+        while True:
+            (topic, publishers), = publishers_of(self, TWIST.name).items()
+            others = sorted(name for names in publishers.values() for name in names)
+            if (own := self.get_fully_qualified_name()) in others:
+                others.remove(own)  # another one may have the same name
+            if not others:
+                return
             self._go_on(handle)
             if time.monotonic() > deadline:
-                raise PlanningError(
-                    f'{listing(others)} may command this arm, too, by '
-                    f'{self.resolve_topic_name(TWIST.name)}: end it, or remap the topic')
+                raise PlanningError(f'{listing(others)} may command this arm, too, by {topic}: '
+                                    'end it, or remap the topic')
             time.sleep(WATCH_S)
+
+    def _why_end(self, handle: ServerGoalHandle) -> str:
+        """Return why a goal has to end, '' while it may go on."""
+        ended, why = self._ended
+        return CANCELLED if handle.is_cancel_requested else (
+            why if ended is handle else self._halt)
+
+    def _go_on(self, handle: ServerGoalHandle) -> None:
+        """Raise Cancelled if the goal has to end."""
+        if why := self._why_end(handle):
+            raise Cancelled(why)
 
     # One goal
 
     def _reach(self, handle: ServerGoalHandle, accepted: float,
                result: ReachGoal.Result) -> None:
         """Show the loop what is seen since `accepted`, do what it answers, fill the result."""
-        request = handle.request
-        mode = settings.check_request(request)
+        request, mode = handle.request, settings.check_request(handle.request)
+        config = settings.reach_config(self.params, request)
         self._goal.begin(request, mode)
         self._inputs.begin(accepted)
         self._refusals.clear()
-        config = settings.reach_config(self.params, request)
         reach = Reach(self._mpc, config, request.seed, accepted)
         while True:
             self._go_on(handle)
             count = self._sensors.count
             while self._refusals:
                 reach.refused(*self._refusals.popleft())
+            # what is seen
             seen, missing = self._inputs.look()
             if self._goal.changed(accepted):
                 reach = Reach(self._mpc, config, request.seed, accepted)
+            # what to do
             answer = reach.step(seen, time.monotonic(), missing)
             result.steps, result.expected_distance = reach.steps, reach.distance
             if isinstance(answer, End):
@@ -262,8 +280,9 @@ class VisualMpcNode(LifecycleBase):
                 result.success, result.message = answer.outcome == 'reached', answer.message
                 return
             if isinstance(answer, SelectTargets):
-                reach.set_targets(self._aim(handle, mode, answer.seen, config.limits),
-                               time.monotonic())
+                targets = self._goal.targets(
+                    answer.seen, self._mpc, config, lambda: self._go_on(handle))
+                reach.set_targets(targets, time.monotonic())
                 continue
             # Before sending: the picture that answers may come at once.
             newest_ns = self._inputs.newest_stamp()
@@ -271,46 +290,9 @@ class VisualMpcNode(LifecycleBase):
                 reach.sent(newest_ns + int(0.9e9 * self.params['control_period']),
                            time.monotonic())
                 result.steps = reach.steps
-                self._tell(handle, reach, answer)
+                self._publish_progress(handle, reach, answer)
             else:
                 self._sensors.wait_for_change(0.1, count)
-
-    def _aim(self, handle: ServerGoalHandle, mode: str, seen: Observation,
-             limits: Limits) -> list[Target]:
-        """Return the Targets of a goal, asking for subgoals in that mode."""
-        if not seen.names:
-            raise PlanningError('objects: none are seen, so there is nothing to push; publish '
-                                'their pixels')
-
-        def give_up() -> bool:
-            return bool(self._why_end(handle))
-
-        request = handle.request
-        picture, objects = self._goal.take(self.params['image_timeout'], give_up)
-        self._go_on(handle)
-        check_found(objects, 'goal_objects')
-        names, pixels = self._inputs.decode_positions(
-            objects, 'goal_objects', None if picture is None else picture.shape[:2])
-        goal_pixels = match_objects(seen.names, names, pixels, 'objects', 'goal_objects')
-        if mode != 'subgoal' or picture is None:
-            return targets_by([], goal_pixels)
-        begin = time.perf_counter()
-        try:
-            found = ask_subgoals(
-                self._client, self._inputs, request, seen, picture, goal_pixels,
-                self.params['predictor_timeout'], give_up)
-        except CallError:
-            self._go_on(handle)
-            raise
-        self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
-
-        def plan(scene: Scene, goal: Goal) -> Plan:
-            self._go_on(handle)
-            return self._mpc.plan(scene, goal, Memory(request.seed), limits)
-
-        return targets_by(choose_sample(
-            self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found, plan),
-            goal_pixels)
 
     def _send(self, handle: ServerGoalHandle, accepted: float, reach: Reach,
               command: Command) -> bool:
@@ -323,26 +305,23 @@ class VisualMpcNode(LifecycleBase):
         seen, _ = self._inputs.look()
         if seen is None:  # the clock has jumped; the next step says so
             return False
-        end = reach.interrupted(seen)
-        if end:
+        if end := reach.interrupted(seen):
             raise PlanningError(end.message)
-        age = time.monotonic() - (
-            seen if seen.stamp_ns == command.seen.stamp_ns else command.seen).received
+        answers = command.seen
+        age = time.monotonic() - (seen if seen.stamp_ns == answers.stamp_ns else answers).received
         if age > self.params['max_age']:
             self.get_logger().warning(
                 f'a command is not sent, as what it answers came {age:.1f} s ago, and max_age is '
                 f'{self.params["max_age"]:g} s: the machine is too slow or busy',
                 throttle_duration_sec=10.0)
             return False
-        if self._goal.changed(accepted):
-            return False
-        return self._arm.send(
-            handle, command.plan.action, to_stamp(command.seen.stamp_ns), self._inputs.topics,
-            ages=command.seen.received < math.inf)
+        return not self._goal.changed(accepted) and self._arm.send(
+            handle, command.plan.action, to_stamp(answers.stamp_ns), self._inputs.topics,
+            ages=answers.received < math.inf)
 
-    def _tell(self, handle: ServerGoalHandle, reach: Reach, command: Command) -> None:
+    def _publish_progress(self, handle: ServerGoalHandle, reach: Reach, command: Command) -> None:
         """Publish feedback, the plan and the distance after a command."""
-        plan, seen = command.plan, command.seen
+        plan, seen, subgoals = command.plan, command.seen, len(reach.targets) - 1
         self._diagnostics.took(plan.planning_ms, 'plan')
         self._distance.publish(Float64(data=reach.distance))
         if self._overlay.get_subscription_count():
@@ -350,35 +329,8 @@ class VisualMpcNode(LifecycleBase):
                                 reach.targets[command.stage].pixels)
             self._overlay.publish(encode_image(
                 picture, to_stamp(seen.stamp_ns), self._inputs.frame_id))
+        stage = 'goal' if command.stage == subgoals else 'subgoal' + (
+            f' {command.stage + 1} of {subgoals}' if subgoals > 1 else '')
         handle.publish_feedback(ReachGoal.Feedback(
-            step=reach.steps, stage=stage_name(command.stage, len(reach.targets) - 1),
-            expected_distance=float(plan.expected_distance),
+            step=reach.steps, stage=stage, expected_distance=float(plan.expected_distance),
             planning_ms=float(plan.planning_ms), plan_samples=plan.num_samples))
-
-    def _is_cancelled(self, handle: ServerGoalHandle) -> bool:
-        return self._cancelled is handle or handle.is_cancel_requested
-
-    def _why_end(self, handle: ServerGoalHandle) -> str:
-        """Return why a goal has to end, '' while it may go on."""
-        return 'cancelled' if self._is_cancelled(handle) else (
-            DESERTED if self._deserted is handle else self._halt)
-
-    def _go_on(self, handle: ServerGoalHandle) -> None:
-        """Raise Cancelled if the goal has to end."""
-        if why := self._why_end(handle):
-            raise Cancelled(why)
-
-
-def cancel_is_known(handle: ServerGoalHandle, seconds: float = 1.0) -> bool:
-    """Wait until rclpy knows that a goal is cancelled, which is after _on_cancel has returned."""
-    deadline = time.monotonic() + seconds
-    while not handle.is_cancel_requested and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return handle.is_cancel_requested
-
-
-def stage_name(index: int, num_subgoals: int) -> str:
-    """Return what feedback calls the target of this index; after the subgoals comes the goal."""
-    if index == num_subgoals:
-        return 'goal'
-    return 'subgoal' if num_subgoals == 1 else f'subgoal {index + 1} of {num_subgoals}'

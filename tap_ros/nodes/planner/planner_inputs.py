@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inputs of visual_mpc_node: messages grouped by their stamp, and decoded once."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 import math
@@ -23,7 +23,7 @@ from tap_ros.messages.objects import decode_cut_objects, decode_states
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.planning.reach import Observation
-from tap_ros.ros.observations import JUMP_NS, Observations, reception_time
+from tap_ros.ros.observations import JUMP_NS, Moment, Observations, reception_time
 from tap_ros.ros.parameters import declared_arm, Parameters
 from tap_ros.ros.robot_view import RobotView
 from tap_ros.ros.subscriptions import publishers_of, rivals
@@ -43,7 +43,7 @@ class PlannerInputs:
     :param crop: returns the TrainedCrop: what the planner makes of pictures, and the size that
         they get.
     :param on_message: called with the topic name after each message.
-    :ivar topics: short names of what is looked at.
+    :ivar topics: short names of what is looked at, the joints last.
     :ivar sensors: Observations.
     :ivar robot: RobotView.
     :ivar frame_id: of the picture that was seen last.
@@ -51,33 +51,30 @@ class PlannerInputs:
 
     def __init__(self, node: Node, params: Parameters, crop: Callable[[], TrainedCrop],
                  on_message: Callable[[str], object]) -> None:
-        self._node, self._params, self._crop = node, params, crop
-        self._camera_size: tuple[int, int] | None = None
-        self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
+        self._node, self._params, self._crop, self._on_message = node, params, crop, on_message
         self.robot = RobotView(params['robot_mask'])
-        self._types = {**camera_topics(params), 'joints': of_topic(JOINT_STATES)}
-        self.topics = tuple(self._types)
-        self._names = [name for _, name in self._types.values()]
-        self._cameras = [name for topic, (_, name) in self._types.items()
-                         if topic in ('image', 'mask')]
-        self._tell = on_message
-        self.sensors = Observations(*self._types)
+        types = {**camera_topics(params), 'joints': of_topic(JOINT_STATES)}
+        self.topics = tuple(types)
+        self._names = {key: name for key, (_, name) in types.items()}
+        self._full = {key: node.resolve_topic_name(name) for key, name in self._names.items()}
+        self.sensors = Observations(*types)
         self._gripper = GripperHistory(
             declared_arm(params), params['joint_prefix'], params['fixed_opening'])
-        self._useless = ''  # why the joint states cannot be used
+        self._joints_error = ''  # why the joint states cannot be used
+        self._camera_size: tuple[int, int] | None = None
+        self._episode = 0, 0  # stamp of its beginning, and jumps of the clock until then
+        self._lock_step = False  # as it was told last
         self.begin(0.0)
-        self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
+        self.sensors.subscribe(node, types, STREAM, on_message=self._on_camera,
                                others={'joints': self._on_joints})
         node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
-        self._told_lock_step = False
         node.create_subscription(Bool, LOCK_STEP, self._on_lock_step, LATCHED)
 
     def begin(self, since: float) -> None:
         """Begin a goal: only what is received from this monotonic time on is seen."""
-        self._since = since
+        self._since, self.frame_id = since, ''
         self._seen: Observation | None = None
-        self.frame_id = ''
-        self._publishers = publishers_of(self._node, self._names)
+        self._publishers = publishers_of(self._node, *self._names.values())
 
     def look(self) -> tuple[Observation | None, str]:
         """
@@ -86,61 +83,41 @@ class PlannerInputs:
         :return: Observation, or None when nothing was; which sensors are silent, '' if none is.
         :raises TapError: for messages that cannot be used.
         """
-        rival = rivals(self._node, self._names, self._publishers)
-        if rival:
+        publishers = publishers_of(self._node, *self._names.values(), LOCK_STEP)
+        pacers = publishers.pop(self._node.resolve_topic_name(LOCK_STEP)).keys()
+        if rival := rivals(publishers, self._publishers):
             raise PlanningError(
                 f'the scene has changed: {rival}; leave one, and send the goal again')
-        cameras = rivals(self._node, self._cameras)
-        if cameras:  # one may have ended just now
-            return None, f'{cameras}; leave one of them'
-        topics = self.topics
-        moment = self.sensors.newest(*topics, since=self._since)
-        missing = self._lacking(topics)
-        if moment is None:
+        if cameras := rivals({name: publishers[name] for key, name in self._full.items()
+                              if key in ('image', 'mask')}):
+            return None, f'{cameras}; leave one of them'  # one may have ended just now
+        found, missing = self._newest(*self.topics[:-1], since=self._since), self._missing()
+        if found is None:
             return None, missing or self._unmatched_joints() or (
-                f'no messages of the same stamp on {self.sensors.names(topics)} since the goal '
-                'was accepted')
-        times: dict[str, Any] = {
-            'received': math.inf if self._lock_step else moment.received,
-            'scene_ns': self._scene_ns(moment.stamp_ns),
-            'jumps': self.sensors.jumps}
-        if self._seen is not None and (self._seen.stamp_ns, self._seen.jumps) == (
-                moment.stamp_ns, times['jumps']):
-            self._seen = replace(self._seen, **times)
-        else:
-            self._seen = self._decode(moment.messages, moment.stamp_ns, times)
+                f'no messages of the same stamp on {self.sensors.names(self.topics)} since the '
+                'goal was accepted')
+        moment, gripper, received = found
+        jumps, (begun_ns, begun_jumps) = self.sensors.jumps, self._episode
+        if self._seen is None or (self._seen.stamp_ns, self._seen.jumps) != (
+                moment.stamp_ns, jumps):
+            self._seen = self._decode(moment, gripper)
             self.frame_id = moment.messages['image'].header.frame_id
+        # Nothing ages where what moves the arm waits for commands, and says so itself.
+        if self._lock_step and pacers and pacers <= publishers[self._full['joints']].keys():
+            received = math.inf
+        known = begun_jumps == jumps and begun_ns <= moment.stamp_ns + JUMP_NS
+        self._seen = replace(
+            self._seen, received=received, scene_ns=begun_ns if known else 0, jumps=jumps)
         return self._seen, missing
-
-    @property
-    def _lock_step(self) -> bool:
-        """Tell whether what moves the arm waits for commands, so that nothing ages."""
-        if not self._told_lock_step:
-            return False
-        tellers, arms = publishers_of(
-            self._node, [LOCK_STEP, self._types['joints'][1]]).values()
-        return bool(tellers) and tellers.keys() <= arms.keys()
 
     def newest_stamp(self) -> int:
         """Return the stamp of the newest picture that has come with its joints, in ns."""
-        moment = self.sensors.newest('image', 'joints')
-        return moment.stamp_ns if moment is not None else -1
-
-    def _scene_ns(self, stamp_ns: int) -> int:
-        """Return when the scene began, 0 if that is unknown or of another clock."""
-        begun_ns, jumps = self._mark
-        known = jumps == self.sensors.jumps and begun_ns <= stamp_ns + JUMP_NS
-        return begun_ns if known else 0
-
-    def _picture(self, messages: dict[str, Any]) -> np.ndarray:
-        """Return the picture of the camera, without the robot if a mask is used."""
-        if self.robot.used:
-            return self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
-        return decode_image(messages['image'], self._types['image'][1])
+        found = self._newest('image')
+        return found[0].stamp_ns if found is not None else -1
 
     def cut(self, picture: np.ndarray, name: str) -> np.ndarray:
         """
-        Return a picture, uint8 (H, W, 3), as the planner sees it.
+        Return what the planner makes of a picture, uint8 (H, W, 3).
 
         :param name: how errors call it.
         :raises ImageError: for one that cannot be cut as in the training.
@@ -163,58 +140,41 @@ class PlannerInputs:
         size = size or self._camera_size or self._crop().size
         return decode_cut_objects(message, name, size, self._crop().of(size, name))
 
-    def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
-        """Take joint states of the gripper, of the arm, or of another driver."""
-        received, name = reception_time(info), self._types['joints'][1]
-        self._tell(name)
-        try:
-            if self._gripper.take(message, received, self.sensors.time_stands):
-                self._useless = ''
-        except TapError as error:
-            self._useless = f'{self.sensors.names(["joints"])}: {error}'
-            return
-        if self._gripper.received > -math.inf:
-            self.sensors.note('joints', self._gripper.received)
-            newest = self.sensors.newest('image')  # again, as joints that come again are newer
-            for stamp_ns in {*self.sensors.without('joints', 'image'),
-                             *([newest.stamp_ns] if newest else [])}:
-                self._match_joints(stamp_ns)
+    def _newest(self, *topics: str, since: float = -math.inf,
+                ) -> tuple[Moment, np.ndarray, float] | None:
+        """Return the newest Moment whose gripper is known, that, and when all was received."""
+        for moment in self.sensors.moments(*topics, since=since):
+            with suppress(KinematicsError):
+                gripper, received = self._gripper.at(
+                    moment.stamp_ns, self._params['max_silence'])
+                if received >= since:
+                    return moment, gripper, min(moment.received, received)
+        return None
 
-    def _match_joints(self, stamp_ns: int) -> None:
-        """Add the gripper's state at the time of a picture, once the arm's joints are known."""
-        with suppress(KinematicsError):  # look() reports it
-            self.sensors.attach('joints', stamp_ns, *self._gripper.at(
-                stamp_ns, self._params['max_silence']))
+    def _missing(self) -> str:
+        """Return which sensors are silent and why, '' if none is."""
+        ages = self.sensors.ages(self.topics, time.monotonic())
+        never = [topic for topic, age in ages.items() if age == math.inf]
+        silent = never or [
+            topic for topic, age in ages.items() if age > self._params['max_silence']]
+        if 'joints' in silent and self._joints_error:
+            return self._joints_error
+        return (f'nothing{"" if never else " new"} has come on '
+                f'{self.sensors.names(silent, explained=True)}' if silent else '')
 
     def _unmatched_joints(self) -> str:
         """Return why the newest picture has no joints, where joints of an arm have come."""
         newest = self.sensors.newest('image')
-        if self._gripper.received == -math.inf or newest is None:
-            return ''
-        try:
-            self._gripper.at(newest.stamp_ns, self._params['max_silence'])
-        except KinematicsError as error:
-            return f'{self.sensors.names(["joints"])}: {error}'
+        if newest is not None and self._gripper.received > -math.inf:
+            try:
+                self._gripper.at(newest.stamp_ns, self._params['max_silence'])
+            except KinematicsError as error:
+                return f'{self.sensors.names(["joints"])}: {error}'
         return ''
 
-    def _on_message(self, name: str) -> None:
-        """Remember what the camera sees behind the robot, between goals too."""
-        self._tell(name)
-        if name == self._types['image'][1]:
-            newest = self.sensors.newest('image')
-            if newest is not None:
-                self._match_joints(newest.stamp_ns)  # again, if the picture was sent again
-        if not self.robot.used or name not in (self._types['image'][1], self._types['mask'][1]):
-            return
-        moment = self.sensors.newest('image', 'mask')
-        if moment is not None:
-            with suppress(TapError):  # look() reports it
-                self._picture(moment.messages)
-
-    def _decode(self, messages: dict[str, Any], stamp_ns: int,
-                times: dict[str, Any]) -> Observation:
+    def _decode(self, moment: Moment, gripper: np.ndarray) -> Observation:
         """Return an Observation; the objects keep the order in which they were seen first."""
-        name, crop = self._types['image'][1], self._crop()
+        name, crop, messages = self._names['image'], self._crop(), moment.messages
         picture = self._picture(messages)
         self._camera_size = picture.shape[:2]
         if crop.crop and crop.camera_size and crop.camera_size != self._camera_size:
@@ -228,25 +188,42 @@ class PlannerInputs:
             order = [names.index(name) for name in self._seen.names]
             names, pixels = self._seen.names, pixels[order]
             states = tuple(states[k] for k in order) if states else ()
-        return Observation(self.cut(picture, name), messages['joints'], names, pixels, stamp_ns,
-                    states=states, **times)
+        return Observation(self.cut(picture, name), gripper, names, pixels, moment.stamp_ns,
+                           states=states)
 
-    def _lacking(self, topics: Collection[str]) -> str:
-        """Return which sensors are silent and why, '' if none is."""
-        missing, ages = self.sensors.missing(topics), self.sensors.ages(topics, time.monotonic())
-        silent = missing or [
-            topic for topic in topics if ages[topic] > self._params['max_silence']]
-        if 'joints' in silent and self._useless:
-            return self._useless
-        what = 'nothing' if missing else 'nothing new'
-        return (f'{what} has come on {self.sensors.names(silent, explained=True)}'
-                if silent else '')
+    def _picture(self, messages: dict[str, Any]) -> np.ndarray:
+        """Return the picture of the camera, without the robot if a mask is used."""
+        if self.robot.used:
+            return self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
+        return decode_image(messages['image'], self._names['image'])
+
+    # What comes
+
+    def _on_camera(self, name: str) -> None:
+        """Remember what the camera sees behind the robot, between goals too."""
+        self._on_message(name)
+        if self.robot.used and name != self._names['objects'] and (
+                moment := self.sensors.newest('image', 'mask')) is not None:
+            with suppress(TapError):  # look() reports it
+                self._picture(moment.messages)
+
+    def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
+        """Take joint states of the gripper, of the arm, or of another driver."""
+        self._on_message(self._names['joints'])
+        try:
+            if self._gripper.take(message, reception_time(info), self.sensors.time_stands):
+                self._joints_error = ''
+        except TapError as error:
+            self._joints_error = f'{self.sensors.names(["joints"])}: {error}'
+            return
+        if self._gripper.received > -math.inf:
+            self.sensors.note('joints', self._gripper.received)
 
     def _on_lock_step(self, message: Bool) -> None:
-        self._told_lock_step = message.data
+        self._lock_step = message.data
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:
-            self._mark = to_nanoseconds(message.header.stamp), self.sensors.jumps
+            self._episode = to_nanoseconds(message.header.stamp), self.sensors.jumps
             self.robot.clear()
             self.sensors.wake()

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,19 +17,73 @@ from tap_ros.base.contract import (
     WORLD_FRAME,
 )
 from tap_ros.base.errors import ConfigError, TapError
-from tap_ros.base.plugins import names
 from tap_ros.base.text import escaped
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
 from tap_ros.planning.reach import ReachConfig
 from tap_ros.planning.visual_mpc import Scene, VisualMPC
-from tap_ros.ros.parameters import check_device, Parameters
+from tap_ros.ros.parameters import check_device, Parameters, setting
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
 MODES = ('subgoal', 'direct')
 SHIPPED = ', '.join(('push', *PLANNING_TASKS))
 MAX_BUDGET = 1000
 MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
+
+
+@dataclass(frozen=True)
+class PlannerParameters:
+    """
+    Parameters that this node alone has.
+
+    :param preset: Settings of the planner: what does best, the same with more samples, or what the
+        paper says.
+    :param solver: What searches the actions: the cross-entropy method (cem), the improved one
+        (icem), or a solver of another package.
+    :param arm_hidden: The arm is not in the pictures.
+    :param control_period: Seconds (of image stamps) that the arm takes for one command.
+    :param twist_scale: Factor of what is sent: 1 for metres per control period, 1 / control_period
+        for metres per second as MoveIt Servo takes them.
+    :param stamp_with_now: Stamp commands with the time of sending, as MoveIt Servo wants them,
+        instead of the stamp of the image that they answer.
+    :param command_frame: Frame of the commands, for their header.
+    :param max_step_xy: Largest |dx| and |dy| of a command in metres; the planner knows it, from
+        the next goal on.
+    :param max_step_z: Largest |dz| of a command in metres; likewise.
+    :param goal_tolerance: A goal is reached at this mean distance of the objects in pixels, a
+        subgoal where the mean expected distance to its maps is so much above the least possible.
+    :param switch: When to go on from a subgoal: when it is reached, or its share of the budget
+        spent; or (half) then alone, as in the paper.
+    :param subgoal_rounds: How often a goal in subgoal mode asks for subgoals: again, from what is
+        seen then, when those of a round are passed.
+    :param max_silence: The arm is stopped when the picture, the objects or the joints have been
+        silent for so many seconds, or when the last command is so old. Has to be longer than the
+        time from one picture to the next.
+    :param command_timeout: Seconds that a command is valid after it came; told to the arm on
+        arm/command_timeout.
+    :param max_age: Seconds; what was received longer ago is not acted upon. A plan ends in time
+        for that, if need be with fewer samples; in lock-step nothing ages.
+    :param image_timeout: Seconds without a usable observation after which a goal is aborted.
+    :param predictor_timeout: Seconds to wait for a subgoal.
+    """
+
+    preset: str = setting('default', choices=tuple(PRESETS))
+    solver: str = setting('cem', plugins='tap_ros.solvers')
+    arm_hidden: bool = False
+    control_period: float = setting(CONTROL_PERIOD, between=(0.01, 10.0))
+    twist_scale: float = setting(1.0, between=(0.001, 1000.0))
+    stamp_with_now: bool = False
+    command_frame: str = WORLD_FRAME
+    max_step_xy: float = setting(MOVE_LIMIT, between=(0.001, MOVE_LIMIT), read_only=False)
+    max_step_z: float = setting(CLIMB_LIMIT, between=(0.02, CLIMB_LIMIT), read_only=False)
+    goal_tolerance: float = setting(GOAL_TOLERANCE, between=(0.0, 64.0), read_only=False)
+    switch: str = setting('reached', choices=SWITCHES, read_only=False)
+    subgoal_rounds: int = setting(1, between=(1, 16), read_only=False)
+    max_silence: float = setting(0.35, between=(0.05, 60.0), read_only=False)
+    command_timeout: float = setting(0.5, between=(0.01, 60.0))
+    max_age: float = setting(3.0, between=(0.1, 600.0), read_only=False)
+    image_timeout: float = setting(5.0, between=(0.1, 600.0), read_only=False)
+    predictor_timeout: float = setting(20.0, between=(0.1, 600.0), read_only=False)
 
 
 def declare_parameters(node: Node) -> Parameters:
@@ -40,56 +95,8 @@ def declare_parameters(node: Node) -> Parameters:
                        f'A forward model: the shipped one, by its name or a task ({SHIPPED}), or '
                        'a file (.safetensors). Can be changed while the node is unconfigured.',
                        read_only=False)
-    parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
-                       'with more samples, or what the paper says.', choices=list(PRESETS))
-    parameters.declare('solver', 'cem', 'What searches the actions: the cross-entropy method '
-                       '(cem), the improved one (icem), or a solver of another package.',
-                       choices=names('tap_ros.solvers'))
-    parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
-    parameters.declare('control_period', CONTROL_PERIOD,
-                       'Seconds (of image stamps) that the arm takes for one command.',
-                       low=0.01, high=10.0)
-    parameters.declare('twist_scale', 1.0,
-                       'Factor of what is sent: 1 for metres per control period, '
-                       '1 / control_period for metres per second as MoveIt Servo takes them.',
-                       low=0.001, high=1000.0)
-    parameters.declare('stamp_with_now', False,
-                       'Stamp commands with the time of sending, as MoveIt Servo wants them, '
-                       'instead of the stamp of the image that they answer.')
-    parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
-    for name, default, low, high, description in (
-            ('max_step_xy', MOVE_LIMIT, 0.001, MOVE_LIMIT, 'Largest |dx| and |dy| of a command in '
-             'metres; the planner knows it, from the next goal on.'),
-            ('max_step_z', CLIMB_LIMIT, 0.02, CLIMB_LIMIT,
-             'Largest |dz| of a command in metres; likewise.'),
-            ('goal_tolerance', GOAL_TOLERANCE, 0.0, 64.0,
-             'A goal is reached at this mean distance of the objects in pixels, a subgoal where '
-             'the mean expected distance to its maps is so much above the least possible.')):
-        parameters.declare(name, default, description, low=low, high=high, read_only=False)
-    parameters.declare('switch', 'reached', 'When to go on from a subgoal: when it is reached, '
-                       'or its share of the budget spent; or (half) then alone, as in the paper.',
-                       choices=SWITCHES, read_only=False)
-    parameters.declare('subgoal_rounds', 1, 'How often a goal in subgoal mode asks for subgoals: '
-                       'again, from what is seen then, when those of a round are passed.',
-                       low=1, high=16, read_only=False)
-    parameters.declare('max_silence', 0.35,
-                       'The arm is stopped when the picture, the objects or the joints have been '
-                       'silent for so many seconds, or when the last command is so old. Has to '
-                       'be longer than the time from one picture to the next.',
-                       low=0.05, high=60.0, read_only=False)
-    parameters.declare('command_timeout', 0.5,
-                       'Seconds that a command is valid after it came; told to the arm on '
-                       'arm/command_timeout.', low=0.01, high=60.0)
-    parameters.declare('max_age', 3.0,
-                       'Seconds; what was received longer ago is not acted upon. A plan ends in '
-                       'time for that, if need be with fewer samples; in lock-step nothing ages.',
-                       low=0.1, high=600.0, read_only=False)
+    parameters.declare_fields(PlannerParameters)
     parameters.declare_arm()
-    parameters.declare('image_timeout', 5.0,
-                       'Seconds without a usable observation after which a goal is aborted.',
-                       low=0.1, high=600.0, read_only=False)
-    parameters.declare('predictor_timeout', 20.0, 'Seconds to wait for a subgoal.',
-                       low=0.1, high=600.0, read_only=False)
     return parameters
 
 

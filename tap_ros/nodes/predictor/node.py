@@ -20,18 +20,18 @@ from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.predictor import requests
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
-from tap_ros.ros import services
+from tap_ros.ros.calls import log_error, reason
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.lifecycle import LifecycleBase
 from tap_ros.ros.parameters import check_device, Parameters
+from tap_ros.ros.polling import DeferredService
 from tap_ros.ros.robot_view import warn_if_unlike
-from tap_ros.ros.ros_messages import encode_image
 from tap_ros.ros.subscriptions import steady_timer
-from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED
+from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, LATCHED
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
-Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 Send = Callable[[PredictSubgoal.Response], object]
+Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 SHOW_PERIOD = 0.1  # s between two checks for a subgoal to publish
@@ -65,8 +65,7 @@ class PredictorNode(LifecycleBase):
         self._unshown: deque[
             tuple[requests.PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
         steady_timer(self, SHOW_PERIOD, self._on_timer)
-        self._service = services.DeferredService(
-            self, PredictSubgoal, 'predict_subgoal', self._on_request)
+        self._service = DeferredService(self, PredictSubgoal, 'predict_subgoal', self._on_request)
         self.autostart('activate')
         self._service.start()
 
@@ -107,20 +106,6 @@ class PredictorNode(LifecycleBase):
         """Return the file of the weights."""
         return predictor_files(self.params['weights'])
 
-    # In the thread of the service
-
-    def _on_request(self, request: PredictSubgoal.Request, send: Send) -> None:
-        """Check a request and put it into the queue, or refuse it."""
-        begin = time.perf_counter()
-        queue, predictor = self._queue, self._predictor
-        try:
-            if not self.active or queue is None or predictor is None:
-                raise ConfigError(self.why_not())
-            task = self._reader.read(request, predictor)
-            queue.put(task, lambda found: self._answer(task, found, send, begin))
-        except Exception as error:
-            self._send(send, self._refusal(error))
-
     # In the executor
 
     def _on_timer(self) -> None:
@@ -142,13 +127,26 @@ class PredictorNode(LifecycleBase):
             self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
         except Exception as error:
             self._diagnostics.error(error)
-            services.log_error(self, 'subgoal', error)
+            log_error(self, 'subgoal', error)
+
+    # In the thread of the service
+
+    def _on_request(self, request: PredictSubgoal.Request, send: Send) -> None:
+        """Check a request and put it into the queue, or refuse it."""
+        begin, queue, predictor = time.perf_counter(), self._queue, self._predictor
+        try:
+            if not self.active or queue is None or predictor is None:
+                raise ConfigError(self.why_not())
+            task = self._reader.read(request, predictor)
+            queue.put(task, lambda found: self._answer(task, found, send, begin))
+        except Exception as error:
+            self._refuse(send, error)
 
     # In the thread of the queue
 
     def _answer(self, task: requests.PendingRequest, found: Found | Exception, send: Send,
                 begin: float) -> None:
-        """Send the response to a task that was received at time `begin`."""
+        """Send the response to a task that came at time `begin`."""
         try:
             if isinstance(found, Exception):
                 raise found
@@ -156,31 +154,24 @@ class PredictorNode(LifecycleBase):
             # Where to go first: the earliest subgoal of the first sample.
             shown = task, found[0][0], response.subgoals[0]
         except Exception as error:
-            self._send(send, self._refusal(error))
+            self._refuse(send, error)
             return
-        self._send(send, response)
+        send(response)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         self._unshown.append(shown)
 
     # In any of them
 
-    def _refusal(self, error: Exception) -> Any:
-        """Return the response that names an error, and log it."""
+    def _refuse(self, send: Send, error: Exception) -> None:
+        """Send the response that names an error, and log it."""
         if isinstance(error, Busy):
             self.get_logger().warning(f'predict_subgoal: {error}', throttle_duration_sec=1.0)
         elif isinstance(error, TapError):
             self.get_logger().warning(f'predict_subgoal refused: {error}')
         else:
             self._diagnostics.error(error)
-        return PredictSubgoal.Response(
-            success=False, message=services.reason(self, 'predict_subgoal', error))
-
-    def _send(self, send: Send, response: PredictSubgoal.Response) -> None:
-        """Send a response; its client may have gone."""
-        try:
-            send(response)
-        except Exception as error:
-            services.log_error(self, 'predict_subgoal: a response cannot be sent', error)
+        send(PredictSubgoal.Response(
+            success=False, message=reason(self, 'predict_subgoal', error)))
 
 
 def predict(predictor: Predictor, tasks: list[requests.PendingRequest]) -> list[Found]:

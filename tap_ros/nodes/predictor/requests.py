@@ -12,6 +12,7 @@ from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.base.contract import CAMERA_FRAME, MODES
@@ -26,10 +27,10 @@ from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.protocol import Predictor, Request
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.polling import PollOnlyGroup
 from tap_ros.ros.robot_view import RobotView
-from tap_ros.ros.ros_messages import encode_subgoal
-from tap_ros.ros.subscriptions import rivals
-from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, STREAM
+from tap_ros.ros.subscriptions import publishers_of, rivals
+from tap_ros.ros.topics import camera_topics, encode_subgoal, goal_topics, LATCHED, STREAM
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
@@ -43,15 +44,14 @@ OBJECTS_TIMEOUT = 0.1  # s that objects and mask of the newest picture may come 
 
 
 @dataclass(frozen=True)
-class AskedPicture:
+class RequestedView:
     """A picture of a request or a topic, ready for the predictor."""
 
     image: np.ndarray  # (H, W, 3) uint8
     names: tuple[str, ...]  # K object names
     pixels: np.ndarray  # (K, 2) float32 (u, v)
-    lacking: str  # why there are no objects; empty if there are
-    stamp: Time
-    frame_id: str
+    no_objects: str  # why there are none; empty if there are
+    header: Header  # of the picture
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class PendingRequest:
     mode: str
     request: Request
     names: tuple[str, ...]  # K object names; none where a picture lacks objects
-    lacking: str  # why there are none; empty if there are
+    no_maps: str  # why there are none; empty if there are
     stamp: Time  # of the start picture
     frame_id: str
 
@@ -89,20 +89,16 @@ class RequestReader:
         for name, types, qos in (('start', camera_topics(params), STREAM),
                                  ('goal', goal_topics(params['robot_mask']), LATCHED)):
             self._newest[name] = Observations(*types, latched=name == 'goal')
-            self._newest[name].subscribe(
-                node, types, qos, on_message=on_message, on_demand=True)
+            self._newest[name].subscribe(node, types, qos, PollOnlyGroup(), on_message)
 
     def poll(self) -> None:
         """Take what has arrived, and remember what the camera sees behind the robot."""
+        start = self._newest['start']
         for observations in self._newest.values():
             observations.poll()
-        if self._robot.used:
-            start = self._newest['start']
-            found = start.newest('image', 'mask')
-            if found is not None:
-                with suppress(TapError):  # a request for this picture is refused with it
-                    self._robot.see(
-                        found.messages['image'], found.messages['mask'], start.jumps)
+        if self._robot.used and (found := start.newest('image', 'mask')) is not None:
+            with suppress(TapError):  # a request for this picture is refused with it
+                self._robot.see(found.messages['image'], found.messages['mask'], start.jumps)
 
     def read(self, request: PredictSubgoal.Request, predictor: Predictor) -> PendingRequest:
         """
@@ -113,38 +109,41 @@ class RequestReader:
         num_samples, depth = request.num_samples or 1, request.recursion_depth or 1
         check_work(num_samples, depth, 0)
         check_mode(request, predictor.mode)
-        crop = predictor.camera_crop
-        start = self._view('start', request.start, request.start_objects, crop)
-        goal = (self._view('goal', request.goal, request.goal_objects, crop)
+        start = self._view('start', request.start, request.start_objects, predictor.camera_crop)
+        goal = (self._view('goal', request.goal, request.goal_objects, predictor.camera_crop)
                 if predictor.mode == 'bidirectional' else None)
-        lacking = '; '.join(view.lacking for view in (start, goal) if view and view.lacking)
-        names = () if lacking else start.names
+        no_maps = '; '.join(view.no_objects for view in (start, goal) if view and view.no_objects)
+        names = () if no_maps else start.names
         check_work(num_samples, depth, len(names))
         goal_pixels = match_objects(
             names, goal.names, goal.pixels, 'start_objects', 'goal_objects'
         ) if names and goal else None
-        request = Request(start.image, goal.image if goal else None,
-                            start.pixels if names else None, goal_pixels,
-                            num_samples, depth, request.seed)
         return PendingRequest(
-            predictor.mode, request, names, lacking, start.stamp, start.frame_id)
+            predictor.mode, Request(
+                start.image, goal.image if goal else None, start.pixels if names else None,
+                goal_pixels, num_samples, depth, request.seed),
+            names, no_maps, start.header.stamp, start.header.frame_id or CAMERA_FRAME)
 
     def _view(self, name: str, image: Image, objects: ObjectStates,
-              crop: TrainedCrop) -> AskedPicture:
+              crop: TrainedCrop) -> RequestedView:
         """Decode a picture and its objects; take the newest ones if it was left empty."""
-        lacking = '' if objects.objects else f'{name}_objects are empty'
+        no_objects = '' if objects.objects else f'{name}_objects are empty'
         found = self._find(name) if is_empty(image) else {'image': image}
         if is_empty(image) and not objects.objects:
             objects = found.get('objects', objects)
-            lacking = '' if objects.objects else self._why_no_objects(name, found)
-        picture, header = self._picture(name, found), found['image'].header
-        given_size = picture.shape[:2]
-        cut = crop.of(given_size, name)
+            no_objects = '' if objects.objects else self._why_no_objects(name, found)
+        if name == 'start' and 'mask' in found:
+            picture = self._robot.see(found['image'], found['mask'], self._newest[name].jumps)
+        else:
+            picture = decode_image(found['image'], name)
+            if 'mask' in found:
+                picture = self._robot.fill_goal(picture, found['mask'])
+        cut = crop.of(picture.shape[:2], name)
         check_found(objects, f'{name}_objects')
-        names, pixels = decode_cut_objects(objects, f'{name}_objects', given_size, cut)
-        return AskedPicture(
-            check_image(cut.image(picture), name, crop.size), names, pixels, lacking,
-            header.stamp, header.frame_id or CAMERA_FRAME)
+        return RequestedView(
+            check_image(cut.image(picture), name, crop.size),
+            *decode_cut_objects(objects, f'{name}_objects', picture.shape[:2], cut),
+            no_objects, found['image'].header)
 
     def _find(self, name: str) -> dict[str, Any]:
         """
@@ -152,40 +151,29 @@ class RequestReader:
 
         :raises ImageError: for a start picture without the mask that it needs.
         """
-        newest = self._newest[name]
-        if name == 'start':
-            cameras = rivals(self._node, self._cameras)
-            if cameras:
-                raise ImageError(f'start: {cameras}; leave one of them, or send a picture along')
+        newest, start = self._newest[name], name == 'start'
+        if start and (cameras := rivals(publishers_of(self._node, *self._cameras))):
+            raise ImageError(f'start: {cameras}; leave one of them, or send a picture along')
         found = newest.newest('image')
         if found is None:
             raise ImageError(
                 f'{name}: the request has none and nothing has come on '
                 f'{newest.names(["image"], explained=True)}; publish one there '
                 '(the simulator does at sim/reset), or send it along')
-        needed, must = ['image'], name == 'start'
+        needed = ['image']
         for topic in ['mask'] * self._robot.used + ['objects']:
             if topic not in found.messages and (
-                    topic == 'mask' and must or not newest.missing([topic])):
+                    topic == 'mask' and start or not newest.missing([topic])):
                 found = newest.wait(
                     (*needed, topic), OBJECTS_TIMEOUT, found.stamp_ns - 1) or found
             if topic in found.messages:
                 needed.append(topic)
-        if self._robot.used and must and 'mask' not in found.messages:
+        if self._robot.used and start and 'mask' not in found.messages:
             raise ImageError(
                 'start: no robot mask with the stamp of the picture, '
                 f'{found.stamp_ns / 1e9:.9f} s, has come on '
                 f'{newest.names(["mask"])}; publish it, or start the node with robot_mask none')
         return found.messages
-
-    def _picture(self, name: str, found: Mapping[str, Any]) -> np.ndarray:
-        """Return the picture of what was found, without the robot if there is a mask."""
-        if name == 'start' and 'mask' in found:
-            return self._robot.see(found['image'], found['mask'], self._newest['start'].jumps)
-        picture = decode_image(found['image'], name)
-        if 'mask' in found:
-            return self._robot.fill_goal(picture, found['mask'])
-        return picture
 
     def _why_no_objects(self, name: str, found: Mapping[str, Any]) -> str:
         """Return why a picture that was found has no objects."""
@@ -206,7 +194,7 @@ def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],
     """Return the response to a PendingRequest."""
     wanted = task.request.num_samples
     message = (f'{task.mode}, {len(subgoals)} subgoal{"s" * (len(subgoals) > 1)}, '
-               + (f'no object maps: {task.lacking}' if task.lacking
+               + (f'no object maps: {task.no_maps}' if task.no_maps
                   else f'maps of {listing(task.names)}'))
     if len(subgoals) < wanted * task.request.recursion_depth:
         message += (f'; one sample instead of {wanted}, as these weights have no latent variable '

@@ -3,13 +3,14 @@
 """Records topics into MCAP bags, as serialized messages; what happens when the disk fails."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 import time
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool
 from tap_ros.base.errors import ConfigError, RecordingError, StorageError
 from tap_ros.base.files import free_folder
@@ -17,12 +18,12 @@ from tap_ros.base.text import escaped
 from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
 from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.recording.writer import BagWriter
+from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
-from tap_ros.ros.parameters import declared_mount, Parameters
-from tap_ros.ros.ros_messages import message_class
-from tap_ros.ros.services import answering
+from tap_ros.ros.parameters import declared_mount, Parameters, setting
+from tap_ros.ros.polling import take_messages
 from tap_ros.ros.subscriptions import AdaptiveSubscription, steady_timer
-from tap_ros.ros.topics import camera_image, SERVICE_QOS
+from tap_ros.ros.topics import camera_image, message_class, SERVICE_QOS
 
 DEPTH = 100  # messages that may wait while the disk is slow
 TRANSIENT_LOCAL = DurabilityPolicy.TRANSIENT_LOCAL
@@ -173,7 +174,7 @@ class RecorderNode(Node):
         streams = {name for name in self._wanted if (known := _known(name)) and known.periodic}
         self._diagnostics = Diagnostics(
             self, streams, set(self._wanted) - streams,
-            expected=self._wanted if 'topics' in self._parameter_overrides else ())
+            expected=self._wanted if self.params['topics'] != [*BY_NAME] else ())
         self._bags = Bags(self.params, self._report)
         if self.params['record_on_start']:
             self._bags.start()
@@ -192,9 +193,9 @@ class RecorderNode(Node):
 
     def _finish(self) -> str:
         """Record what has arrived, such as the end of an episode, and finish the bag."""
-        for subscription in self._recorded.values():
-            for message, info in subscription.take(DEPTH):
-                subscription.subscription.callback(message, info)
+        for one in self._recorded.values():
+            for message, info in take_messages(one.subscription, DEPTH):
+                one.subscription.callback(message, info)
         recorded, text = self._bags.folder, self._bags.finish()
         if recorded and self._bags.failure is None:
             self.get_logger().info(f'recorded {text}')
@@ -238,12 +239,9 @@ class RecorderNode(Node):
     def _on_message(self, topic: str, type_name: str, data: bytes, info: dict[str, Any]) -> None:
         self._diagnostics.received(topic)
         asked = self._recorded[topic].qos
-        latched = asked.durability == TRANSIENT_LOCAL
-        qos = Qos(
-            depth=1 if latched else 10,
-            durability='transient_local' if latched else 'volatile',
-            reliability='reliable' if asked.reliability == ReliabilityPolicy.RELIABLE
-            else 'best_effort')
+        qos = Qos(depth=1 if asked.durability == TRANSIENT_LOCAL else 10,
+                  durability=asked.durability.name.lower(),
+                  reliability=asked.reliability.name.lower())
         received = info['received_timestamp'] or time.time_ns()
         try:
             self._bags.take(topic, type_name, data, qos, received,
@@ -267,16 +265,26 @@ def _known(name: str) -> Topic | None:
     return BY_NAME.get(name.lstrip('/').removesuffix('/compressed'))
 
 
+@dataclass(frozen=True)
+class RecorderParameters:
+    """
+    Parameters that this node alone has.
+
+    :param folder: Folder of the bag; if it exists, a number is added to the name.
+    :param compression: Compression of chunks.
+    :param record_on_start: Record from the start; else from the call of recorder/record on.
+    """
+
+    folder: str = 'bags/recording'
+    compression: str = setting('zstd', choices=('zstd', 'lz4', 'none'))
+    record_on_start: bool = True
+
+
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('folder', 'bags/recording',
-                       'Folder of the bag; if it exists, a number is added to the name.')
+    parameters.declare_fields(RecorderParameters)
     parameters.declare('topics', list(BY_NAME), 'Topics to record.')
-    parameters.declare('compression', 'zstd', 'Compression of chunks.',
-                       choices=['zstd', 'lz4', 'none'])
     parameters.declare_shared('image_transport')
     parameters.declare_arm()
-    parameters.declare('record_on_start', True,
-                       'Record from the start; else from the call of recorder/record on.')
     return parameters

@@ -3,6 +3,7 @@
 """Publishes masks of a real robot: its URDF, projected into each picture of the camera."""
 
 from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 import time
 from typing import Any
@@ -22,18 +23,18 @@ from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
 from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
+from tap_ros.ros.calls import log_error
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
-from tap_ros.ros.parameters import declared_mount, Parameters
-from tap_ros.ros.ros_messages import encode_mask
-from tap_ros.ros.services import log_error
+from tap_ros.ros.parameters import CameraParameters, declared_mount, Parameters, setting
 from tap_ros.ros.subscriptions import (
     adapt_regularly,
     AdaptiveSubscription,
+    publishers_of,
     rivals,
     steady_timer,
 )
-from tap_ros.ros.topics import LATCHED, STREAM
+from tap_ros.ros.topics import encode_mask, LATCHED, STREAM
 
 WAITING = 100  # pictures that may wait for their joint states
 
@@ -98,7 +99,7 @@ class RobotMaskNode(Node):
         try:
             self._use(read_urdf(message.data, 'robot_description'))
         except TapError as error:
-            self._tell(error)
+            self._report(error)
 
     def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
         self._diagnostics.received('joint_states')
@@ -108,7 +109,7 @@ class RobotMaskNode(Node):
             if self._history.add(message, reception_time(info)):
                 self._answer_waiting()
         except TapError as error:
-            self._tell(f'joint_states: {error}')
+            self._report(f'joint_states: {error}')
 
     def _on_camera_info(self, message: CameraInfo, info: dict[str, Any]) -> None:
         self._diagnostics.received('camera/camera_info')
@@ -126,7 +127,7 @@ class RobotMaskNode(Node):
                 waited = time.monotonic() - received
                 if isinstance(error, KinematicsError) and waited <= self.params['max_silence']:
                     continue  # joints may come
-                self._tell(error)
+                self._report(error)
             except Exception as error:  # it costs this picture
                 self._diagnostics.error(error)
                 log_error(self, 'robot mask', error)
@@ -140,7 +141,7 @@ class RobotMaskNode(Node):
         :raises ImageError: for a camera that cannot be used.
         """
         begin, robot = time.perf_counter(), self._robot
-        cameras = rivals(self, ['camera/camera_info'])
+        cameras = rivals(publishers_of(self, 'camera/camera_info'))
         if cameras:
             raise ImageError(f'{cameras}; leave one of them')
         if robot is None:
@@ -159,44 +160,54 @@ class RobotMaskNode(Node):
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'mask')
         return mask
 
-    def _tell(self, error: object) -> None:
+    def _report(self, error: object) -> None:
         """Log why a picture has no mask, at most every 5 s."""
         self._diagnostics.error(error)
         self.get_logger().error(
             f'no robot mask: {escaped(error, 1000)}', throttle_duration_sec=5.0)
 
 
+@dataclass(frozen=True)
+class RobotMaskParameters:
+    """
+    Parameters that this node alone has.
+
+    :param urdf: Shape of the robot: a URDF file; the name of an arm: that arm, at mount_x and so
+        on; empty: the topic robot_description.
+    :param hand_link: Link that is the hand, with all that it carries; empty: there is none, or
+        with a named arm its own.
+    :param hand_radius: With a named arm: radius of a cylinder around the hand, from the flange to
+        the fingertips, m.
+    :param base_frame: Link of the robot in which the pose of the camera is given; empty: its root.
+    :param dilation: Pixels by which the mask is larger than the shapes on all sides.
+    :param shadow: Mark the shadow on the table, too, as of one light from afar.
+    :param table_height: z of the table in base_frame, m.
+    :param light_x: x of the direction in which the light shines, in base_frame.
+    :param light_y: y of the direction in which the light shines, in base_frame.
+    :param light_z: z of the direction in which the light shines, in base_frame.
+    :param max_silence: Seconds; a picture without joint states nearer to it than this gets no
+        mask.
+    """
+
+    urdf: str = ''
+    hand_link: str = ''
+    hand_radius: float = setting(0.06, between=(0.001, 1.0))
+    base_frame: str = ''
+    dilation: float = setting(1.0, between=(0.0, 100.0), read_only=False)
+    shadow: bool = False
+    table_height: float = setting(0.0, between=(-10.0, 10.0))
+    light_x: float = setting(0.0, between=(-100.0, 100.0))
+    light_y: float = setting(0.0, between=(-100.0, 100.0))
+    light_z: float = setting(-1.0, between=(-100.0, 100.0))
+    max_silence: float = setting(0.35, between=(0.05, 60.0), read_only=False)
+
+
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('urdf', '',
-                       'Shape of the robot: a URDF file; the name of an arm: that arm, at '
-                       'mount_x and so on; empty: the topic robot_description.')
     parameters.declare_shared('joint_prefix')
-    parameters.declare('hand_link', '',
-                       'Link that is the hand, with all that it carries; empty: there is none, or '
-                       'with a named arm its own.')
-    parameters.declare('hand_radius', 0.06,
-                       'With a named arm: radius of a cylinder around the hand, from the flange '
-                       'to the fingertips, m.', low=0.001, high=1.0)
-    parameters.declare_camera('base_frame')
-    parameters.declare('base_frame', '',
-                       'Link of the robot in which the pose of the camera is given; empty: its '
-                       'root.')
-    parameters.declare('dilation', 1.0,
-                       'Pixels by which the mask is larger than the shapes on all sides.',
-                       low=0.0, high=100.0, read_only=False)
-    parameters.declare('shadow', False,
-                       'Mark the shadow on the table, too, as of one light from afar.')
-    parameters.declare('table_height', 0.0, 'z of the table in base_frame, m.',
-                       low=-10.0, high=10.0)
-    for axis, value in zip('xyz', (0.0, 0.0, -1.0)):
-        parameters.declare(f'light_{axis}', value,
-                           f'{axis} of the direction in which the light shines, in base_frame.',
-                           low=-100.0, high=100.0)
-    parameters.declare('max_silence', 0.35,
-                       'Seconds; a picture without joint states nearer to it than this gets no '
-                       'mask.', low=0.05, high=60.0, read_only=False)
+    parameters.declare_fields(RobotMaskParameters)
+    parameters.declare_fields(CameraParameters)
     named = parameters['urdf'] in names('tap_ros.arms')
     parameters.declare_mount(parameters['urdf'] if named else DEFAULT_ARM)
     return parameters
