@@ -78,7 +78,7 @@ def run(args: Options) -> None:
     :raises TapError: for a set that cannot be read, and a folder that holds something.
     """
     data = DataSet(args.path, args.camera)
-    said = write_bag(args, data.episodes(args.cut), len(data.rows), data.skipped)
+    said = write_bag(args, data.episodes(args.cut), data.skipped, len(data.rows))
     print(f'{said} of {escaped(data.camera)}')
     if any(data.marks):
         path = beside(args.out)
