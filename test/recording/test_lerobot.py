@@ -18,7 +18,7 @@ import pytest
 from tap_ros.apps.cli import main
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats import lerobot_export
-from tap_ros.recording.formats.lerobot import ACTION, CAMERA, OBJECTS, STATE
+from tap_ros.recording.formats.lerobot_format import ACTION, CAMERA, OBJECTS, STATE
 from tap_ros.recording.marks import beside, read_marks, write_marks
 
 

@@ -31,6 +31,7 @@ from tap_ros.recording.bags import what_else, what_is
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import (
     decoded,
+    FILES,
     find_files,
     make_episode,
     Options,
@@ -73,7 +74,7 @@ def run(args: Options) -> None:
                             yield make_episode(
                                 frames, rows / (args.fps or FPS), task=args.task, seed=number)
 
-    print(write_bag(args, episodes(), skipped=skipped))
+    print(write_bag(args, episodes(), skipped))
 
 
 def _chosen(arrays: Collection[str], camera: str) -> list[str]:
@@ -164,7 +165,7 @@ def _holds_pictures(array: Any, budget: Budget) -> bool:
         return True
     first = _row(array, 0, budget)
     is_file = isinstance(first, bytes | np.void) or getattr(first, 'dtype', None) == np.uint8
-    return is_file and bytes(first).startswith((b'\xff\xd8\xff', b'\x89PNG'))
+    return is_file and bytes(first).startswith(FILES)
 
 
 def _picture(values: Any) -> np.ndarray:

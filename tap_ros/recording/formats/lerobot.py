@@ -21,14 +21,29 @@ from typing import Annotated, Any
 import warnings
 
 import numpy as np
-from tap_ros.base.contract import GRIPPER_JOINTS, MAX_PICTURE_BYTES
+from tap_ros.base.contract import MAX_PICTURE_BYTES
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
-from tap_ros.recording.bags import what_else
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
+from tap_ros.recording.formats.lerobot_format import (
+    ACTION,
+    INDICES,
+    INFO,
+    listed,
+    MOST_BYTES,
+    NAMES,
+    object_columns,
+    OBJECTS,
+    OUTCOME,
+    read_parquet,
+    SEED,
+    STATE,
+    SUBTASK,
+    Video,
+)
 from tap_ros.recording.formats.pictures import (
     DAMAGE,
     decoded,
@@ -41,20 +56,12 @@ from tap_ros.recording.formats.pictures import (
 )
 from tap_ros.recording.marks import beside, write_marks
 from tap_ros.recording.metadata import natural
-from tap_ros.recording.trust import Budget, inside, parse_json, read_bytes
+from tap_ros.recording.trust import inside, parse_json, read_bytes
 from tyro import conf
 
-INFO = 'meta/info.json'
-CAMERA = 'observation.images.camera'
-STATE, OBJECTS, ACTION = 'observation.state', 'observation.environment_state', 'action'
-NAMES = {ACTION: ['dx', 'dy', 'dz', 'opening'], STATE: list(GRIPPER_JOINTS)}  # of our numbers
-INDICES = ('frame_index', 'episode_index', 'index', 'task_index')  # columns that all sets have
-SUBTASK = 'subtask_index'  # column of the sets that have meta/subtasks.parquet, too
-SEED, OUTCOME = 'tap_ros/seed', 'tap_ros/outcome'  # columns of ours beside LeRobot's
 _OF_EPISODES = 'episode_index', 'length', 'tasks', 'dataset_from_index', SEED, OUTCOME
 _LINES = 'meta/episodes.jsonl'
-_MOST_BYTES, _MOST_ROWS, _MOST_EPISODES = 2**26, 10**7, 10**6  # of JSON, of a table, of a set
-_BATCH = 256  # rows that are read at once
+_MOST_EPISODES = 10**6  # of a set
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +85,7 @@ def run(args: Options) -> None:
     :raises TapError: for a set that cannot be read, and a folder that holds something.
     """
     data = DataSet(args.path, args.camera)
-    said = write_bag(args, data.episodes(args.cut), len(data.rows), data.skipped)
+    said = write_bag(args, data.episodes(args.cut), data.skipped, len(data.rows))
     print(f'{said} of {escaped(data.camera)}')
     if any(data.marks):
         path = beside(args.out)
@@ -108,7 +115,7 @@ class DataSet:
         self.folder = Path(folder)
         place = escaped(self.folder / INFO)
         try:
-            info = parse_json(read_bytes(inside(self.folder, INFO), _MOST_BYTES))
+            info = parse_json(read_bytes(inside(self.folder, INFO), MOST_BYTES))
             version, self.fps = str(info['codebase_version']), float(info['fps'])
             self.features = dict(info['features'])
             self._data_path, self._video_path = str(info['data_path']), info.get('video_path')
@@ -143,7 +150,7 @@ class DataSet:
         self._starts = self._find_starts() if self._is_video else {}
         self.rows = [row for row in self.rows
                      if row['episode_index'] in self._starts or not self._is_video]
-        self._video: _Video | None = None
+        self._video: Video | None = None
 
     def episodes(self, crop: Crop) -> Iterator[Episode]:
         """
@@ -182,13 +189,13 @@ class DataSet:
         found: list[Any] = []
         for file in sorted((self.folder / 'meta' / 'episodes').glob('*/*.parquet'), key=natural):
             with self.skipped.errors_of('file', f'meta/episodes/{escaped(file.name)}'):
-                table = self._read_parquet(file.relative_to(self.folder))
+                table = read_parquet(self.folder, file.relative_to(self.folder))
                 for part in table.select([name for name in table.column_names if name.startswith(
                         (*_OF_EPISODES, 'data/', 'videos/'))]).to_batches():
-                    found += map(_cut_short, _listed(part))
+                    found += map(_cut_short, listed(part))
         if not found and (self.folder / _LINES).exists():
             with self.skipped.errors_of('file', _LINES):
-                found = read_bytes(inside(self.folder, _LINES), _MOST_BYTES).splitlines()
+                found = read_bytes(inside(self.folder, _LINES), MOST_BYTES).splitlines()
         rows: list[dict[str, Any]] = []
         for number, one in enumerate(filter(None, found[:_MOST_EPISODES])):
             with self.skipped.errors_of('row', f'{number} of meta/episodes'):
@@ -230,11 +237,11 @@ class DataSet:
         path = self._path(self._data_path, row, 'data')
         if self._file is None or self._file[0] != path:
             self._file = None  # before another one is in memory
-            self._file = path, self._read_parquet(path)
+            self._file = path, read_parquet(self.folder, path)
         table, T = self._file[1], row['length']
         first = table['index'][0].as_py()
         part = table.slice(row.get('dataset_from_index', first) - first, T)
-        if len(part) != T or set(_listed(part['episode_index'])) != {row['episode_index']}:
+        if len(part) != T or set(listed(part['episode_index'])) != {row['episode_index']}:
             raise ValueError('its rows are not where meta/episodes says')
         return part
 
@@ -277,7 +284,7 @@ class DataSet:
         T = len(kept)
 
         def numbers(key: str, width: int) -> np.ndarray:
-            return np.array(_listed(part[key]), np.float32).reshape(-1, width)[kept]
+            return np.array(listed(part[key]), np.float32).reshape(-1, width)[kept]
 
         known: dict[str, Any] = {}
         if self._objects:
@@ -290,33 +297,15 @@ class DataSet:
         outcome, seconds = row.get(OUTCOME, ''), np.arange(len(part)) / self.fps
         self.marks.append([])
         if SUBTASK in self.features:
-            ends = np.flatnonzero(np.diff(np.ravel(_listed(part[SUBTASK]))[kept]))
+            ends = np.flatnonzero(np.diff(np.ravel(listed(part[SUBTASK]))[kept]))
             self.marks[-1] = ends[ends > 0].tolist()
-        told = np.array(_listed(part['timestamp']), float).ravel()
+        told = np.array(listed(part['timestamp']), float).ravel()
         if (np.abs(told - told[0] - seconds) > 0.5 / self.fps).any() and (np.diff(told) > 0).all():
             seconds = told  # another rate than that of the description
         return make_episode(
             frames, seconds[kept], self._objects,
             task=row['tasks'], seed=int(row.get(SEED, row['episode_index'])),
             outcome=outcome if outcome in OUTCOMES else '', **known)
-
-    def _read_parquet(self, name: Path) -> Any:
-        """Read a table of the set, in parts, as a short file can hold a long one."""
-        import pyarrow
-        from pyarrow import parquet
-        path = inside(self.folder, name)
-        try:
-            with parquet.ParquetFile(path) as file:
-                if file.metadata.num_rows > _MOST_ROWS:
-                    raise ValueError(f'it has more than {_MOST_ROWS} rows')
-                budget, parts = Budget(path.stat().st_size), []
-                for part in file.iter_batches(_BATCH):
-                    budget.take(part.nbytes)
-                    parts.append(part)
-                return pyarrow.Table.from_batches(parts)
-        except (*DAMAGE, pyarrow.ArrowException) as error:
-            why = what_else(path) or f'cannot be read: {escaped(error, 200)}'
-            raise RecordingError(f'{escaped(name)}: {why}') from error
 
     def _file_of(self, cell: Any) -> bytes:
         """Return the picture file of a row: its bytes, or what has its name."""
@@ -329,9 +318,9 @@ class DataSet:
         """Return the time of each row in a video, and what returns the frame of a time."""
         path = self._path(self._video_path, row, f'videos/{self.camera}')
         times = self._starts[row['episode_index']] + np.array(
-            _listed(part['timestamp']), float).ravel()
+            listed(part['timestamp']), float).ravel()
         if self._video is None or self._video.path != path or self._video.now[0] > times[0]:
-            self._video = _Video(path, video_frames(inside(self.folder, path)))
+            self._video = Video(path, video_frames(inside(self.folder, path)))
         video = self._video
 
         def show(at: float) -> np.ndarray:
@@ -340,46 +329,6 @@ class DataSet:
                 raise RecordingError(f'{escaped(path)} has no frame at {at:.3f} s')
             return picture
         return times.tolist(), show
-
-
-class _Video:
-    """
-    A video from which frames are taken one after the other, by their times.
-
-    :param path: its name in the set.
-    :param frames: as video_frames yields them.
-    :ivar now: (seconds, picture) that was taken last.
-    """
-
-    def __init__(self, path: Path, frames: Iterator[tuple[float, np.ndarray]]) -> None:
-        self.path, self._frames = path, frames
-        first = next(frames, None)
-        if not first:
-            raise RecordingError(f'{escaped(path)} has no frame')
-        self.now, self._next = first, next(frames, None)
-
-    def at(self, seconds: float) -> tuple[float, np.ndarray]:
-        """Return the frame nearest to a time, of those not before the last one."""
-        while self._next and abs(self._next[0] - seconds) <= abs(self.now[0] - seconds):
-            self.now, self._next = self._next, next(self._frames, None)
-        return self.now
-
-
-def object_columns(names: tuple[str, ...]) -> list[str]:
-    """Return the names of the numbers in OBJECTS: u and v of each object."""
-    return [f'{name}_{axis}' for name in names for axis in 'uv']
-
-
-def _listed(values: Any) -> list[Any]:
-    """
-    Return what a table holds as Python's values, which take far more memory.
-
-    :raises ValueError: for more than descriptions and numbers have.
-    """
-    if values.nbytes > _MOST_BYTES or 'dictionary' in str(
-            getattr(values, 'schema', None) or values.type):  # whose values repeat
-        raise ValueError('its columns hold more than numbers and names')
-    return list(values.to_pylist())
 
 
 def _is_depth(feature: dict[str, Any]) -> bool:

@@ -22,7 +22,7 @@ from tap_ros.base.options import Bags, File, Folder
 from tap_ros.base.text import escaped
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
-from tap_ros.recording.formats.lerobot import (
+from tap_ros.recording.formats.lerobot_format import (
     ACTION,
     CAMERA,
     INDICES,

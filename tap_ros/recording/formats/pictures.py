@@ -37,6 +37,7 @@ from tqdm import tqdm
 from tyro import conf
 
 EPISODES_PER_FILE = 25
+FILES = b'\xff\xd8\xff', b'\x89PNG'  # how JPEG and PNG files begin
 DAMAGE = (ImageError, RecordingError, OSError, LookupError, TypeError, ValueError, AttributeError,
           ArithmeticError, MemoryError, RuntimeError, cv2.error)  # of files made by others
 _MOST_SECONDS = 86400  # of a demonstration
@@ -113,7 +114,7 @@ def run(args: Options) -> None:
                     frames, rows / args.fps if args.fps else np.array(seconds)[rows],
                     task=args.task, seed=number)
 
-    print(write_bag(args, episodes(), len(files), skipped))
+    print(write_bag(args, episodes(), skipped, len(files)))
 
 
 def _noting(seconds: list[float],
@@ -249,15 +250,15 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
                    **(fields | known))
 
 
-def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = None,
-              skipped: Skipped | None = None) -> str:
+def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
+              count: int | None = None) -> str:
     """
     Write episodes one after the other, in files of EPISODES_PER_FILE: all of them, or nothing.
 
     :param target: Target.
     :param episodes: iterable of Episode, whose stamps count from anywhere.
-    :param count: how many there are, to show progress.
     :param skipped: what could not be used of them, when they have been read.
+    :param count: how many there are, to show progress.
     :return: a line that says what was written.
     :raises ConfigError: for a folder that holds something.
     :raises RecordingError: when there is no episode.
@@ -280,7 +281,7 @@ def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = N
                     writer.write(replace(episode, stamps=stamps))
                     begin, size = int(stamps[-1]) + EPISODE_SPACING_NS, episode.frames.shape[1:3]
                     frames, done = frames + len(episode), done + 1
-            (skipped or Skipped()).warn(out, is_empty=not done)
+            skipped.warn(out, is_empty=not done)
             write_metadata(part)
             with storage_errors(out):
                 part.rename(out)

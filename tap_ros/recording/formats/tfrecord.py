@@ -30,14 +30,13 @@ from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import (
     decoded,
+    FILES,
     find_files,
     make_episode,
     Options,
     Skipped,
     write_bag,
 )
-
-_FILES = b'\xff\xd8\xff', b'\x89PNG'  # JPEG, PNG
 
 FPS = 5.0  # where nobody says another
 _MOST_RECORD = 2**31  # bytes; those of protobuf have fewer
@@ -73,7 +72,7 @@ def run(args: Options) -> None:
                             list(map(args.cut.image, frames)), rows / (args.fps or FPS),
                             task=said[0].decode(errors='replace'), seed=number)
 
-    print(f'{write_bag(args, episodes(), skipped=skipped)} of {escaped(camera)}')
+    print(f'{write_bag(args, episodes(), skipped)} of {escaped(camera)}')
     if blank[True]:
         print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
 
@@ -121,13 +120,13 @@ def _pictures(features: dict[str, list[bytes]], camera: str) -> list[bytes]:
 def _is_picture(data: bytes) -> bool:
     """Tell whether bytes are a picture file, or the pixels of a square picture."""
     side = math.isqrt(len(data) // 3)
-    return data.startswith(_FILES) or side >= 8 and side * side * 3 == len(data)
+    return data.startswith(FILES) or side >= 8 and side * side * 3 == len(data)
 
 
 def _picture(data: bytes) -> np.ndarray:
     """Return a picture, uint8 (H, W, 3)."""
     side = math.isqrt(len(data) // 3)
-    if data.startswith(_FILES) or side * side * 3 != len(data):
+    if data.startswith(FILES) or side * side * 3 != len(data):
         return decompress(data, 'unknown')
     return np.frombuffer(data, np.uint8).reshape(side, side, 3)
 

@@ -1,0 +1,88 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a LeRobotDataset is made of: names, tables and videos."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tap_ros.base.contract import GRIPPER_JOINTS
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.text import escaped
+from tap_ros.recording.bags import what_else
+from tap_ros.recording.formats.pictures import DAMAGE
+from tap_ros.recording.trust import Budget, inside
+
+INFO = 'meta/info.json'
+CAMERA = 'observation.images.camera'
+STATE, OBJECTS, ACTION = 'observation.state', 'observation.environment_state', 'action'
+NAMES = {ACTION: ['dx', 'dy', 'dz', 'opening'], STATE: list(GRIPPER_JOINTS)}  # of our numbers
+INDICES = ('frame_index', 'episode_index', 'index', 'task_index')  # columns that all sets have
+SUBTASK = 'subtask_index'  # column of the sets that have meta/subtasks.parquet, too
+SEED, OUTCOME = 'tap_ros/seed', 'tap_ros/outcome'  # columns of ours beside LeRobot's
+MOST_BYTES, _MOST_ROWS = 2**26, 10**7  # of JSON, of a table
+_BATCH = 256  # rows that are read at once
+
+
+def object_columns(names: tuple[str, ...]) -> list[str]:
+    """Return the names of the numbers in OBJECTS: u and v of each object."""
+    return [f'{name}_{axis}' for name in names for axis in 'uv']
+
+
+def listed(values: Any) -> list[Any]:
+    """
+    Return what a table holds as Python's values, which take far more memory.
+
+    :raises ValueError: for more than descriptions and numbers have.
+    """
+    if values.nbytes > MOST_BYTES or 'dictionary' in str(
+            getattr(values, 'schema', None) or values.type):  # whose values repeat
+        raise ValueError('its columns hold more than numbers and names')
+    return list(values.to_pylist())
+
+
+def read_parquet(folder: Path, name: Path) -> Any:
+    """
+    Read a table of a set, in parts, as a short file can hold a long one.
+
+    :raises RecordingError: when it cannot be read.
+    """
+    import pyarrow
+    from pyarrow import parquet
+    path = inside(folder, name)
+    try:
+        with parquet.ParquetFile(path) as file:
+            if file.metadata.num_rows > _MOST_ROWS:
+                raise ValueError(f'it has more than {_MOST_ROWS} rows')
+            budget, parts = Budget(path.stat().st_size), []
+            for part in file.iter_batches(_BATCH):
+                budget.take(part.nbytes)
+                parts.append(part)
+            return pyarrow.Table.from_batches(parts)
+    except (*DAMAGE, pyarrow.ArrowException) as error:
+        why = what_else(path) or f'cannot be read: {escaped(error, 200)}'
+        raise RecordingError(f'{escaped(name)}: {why}') from error
+
+
+class Video:
+    """
+    A video from which frames are taken one after the other, by their times.
+
+    :param path: its name in the set.
+    :param frames: as video_frames yields them.
+    :ivar now: (seconds, picture) that was taken last.
+    """
+
+    def __init__(self, path: Path, frames: Iterator[tuple[float, np.ndarray]]) -> None:
+        self.path, self._frames = path, frames
+        first = next(frames, None)
+        if not first:
+            raise RecordingError(f'{escaped(path)} has no frame')
+        self.now, self._next = first, next(frames, None)
+
+    def at(self, seconds: float) -> tuple[float, np.ndarray]:
+        """Return the frame nearest to a time, of those not before the last one."""
+        while self._next and abs(self._next[0] - seconds) <= abs(self.now[0] - seconds):
+            self.now, self._next = self._next, next(self._frames, None)
+        return self.now
