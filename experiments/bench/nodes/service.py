@@ -118,7 +118,7 @@ def run(args):
 def compare_latency(stream, rounds, calls):
     """Time the model alone and the service in turns, so many calls in a turn."""
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
-    request = Request(*pictures(), *PIXELS)
+    asked = Request(*pictures(), *PIXELS)
     alone, together, service, inside = [], [], [], []
     with Client() as client:
         ask, request = make_client(client, SERVICE_QOS.depth), make_request()
@@ -127,8 +127,8 @@ def compare_latency(stream, rounds, calls):
         call(ask, request, 120)
         for _ in range(rounds):
             os.kill(stream.pid, signal.SIGSTOP)
-            alone += timed(lambda: predictor.predict_together([request]), calls)
-            together += timed(lambda: predictor.predict_together([request] * TOGETHER),
+            alone += timed(lambda: predictor.predict_together([asked]), calls)
+            together += timed(lambda: predictor.predict_together([asked] * TOGETHER),
                               -(-calls // TOGETHER))
             os.kill(stream.pid, signal.SIGCONT)
             service += timed(lambda: inside.append(
