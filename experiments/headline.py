@@ -16,11 +16,7 @@ PAPER, FIXED, HERE = '#8c8c8c', COLOURS['fix'], COLOURS['ours']
 
 
 def bars():
-    """
-    Return what is drawn: title -> group -> [(label, colour, value, low, high)], in percent.
-
-    Low and high are 95% intervals; None where none is known.
-    """
+    """Return title -> group -> [(label, colour, value, low, high)], %; None is not known."""
     def percent(file, **wanted):
         found = find(RESULTS, file, **wanted)
         return [100 * found[name] for name in ('value', 'ci_low', 'ci_high')]

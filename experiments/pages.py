@@ -9,25 +9,13 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 
 def render(template, **values):
-    """
-    Fill a template.
-
-    :param template: its path in experiments/.
-    :param values: what it names.
-    :return: Markdown, with one empty line where the template leaves several.
-    :raises jinja2.UndefinedError: if it names something else.
-    """
+    """Fill a template of experiments/; one empty line is left where there are several."""
     text = _ENVIRONMENT.get_template(template).render(values)
     return re.sub(r'\n{3,}', '\n\n', text.strip('\n')) + '\n'
 
 
 def markdown(table, left=1):
-    """
-    Write a table.
-
-    :param table: DataFrame; its index is not shown, cells that have nothing are '-'.
-    :param left: so many columns are aligned to the left, the others to the right.
-    """
+    """Write a DataFrame, '-' for nothing; so many columns are aligned to the left."""
     cells = table.astype(object).where(table.notna(), '-')
     rule = ['---' if i < left else '---:' for i in range(table.shape[1])]
     return '\n'.join(f'| {" | ".join(map(str, line))} |'

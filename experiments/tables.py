@@ -33,15 +33,7 @@ TASKS = {'grasp': 'grasping', 'pick_place': 'pick-and-place', 'push2': 'pushing 
 
 
 def find(folder, file, **wanted):
-    """
-    Find a row of a data file.
-
-    :param folder: of the file.
-    :param file: PREDICTION, PLANNING or STACKING.
-    :param wanted: values of columns.
-    :return: Series.
-    :raises ConfigError: unless one row fits.
-    """
+    """Return the one row of a data file whose columns have these values; ConfigError otherwise."""
     path = Path(folder) / file
     rows = read(path)
     if not {'compares', 'against'} & set(wanted):  # no difference

@@ -14,11 +14,10 @@ import json
 from pathlib import Path
 
 from experiments.pages import render, share
-from experiments.tables import find, number
+from experiments.tables import find, number, RESULTS
+from experiments.tracks import draw, score_bag, score_films
 import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
-from tap_ros.apps.evaluate import Tracking
-from tap_ros.apps.evaluate_tracking import draw, score
 from tap_ros.base.engines import Engine
 from tap_ros.base.files import write_atomically, write_rows
 from tap_ros.base.options import Folder
@@ -29,9 +28,9 @@ TASKS = ('push2', 'push3', 'order2')
 EPISODES = {'arm': 10, 'hand': 4}  # by look
 SIZE, SMALL = 256, 64
 OFF = 1.35  # px of 64 that a person's clicks are off
-# Look, size (0: SIZE), clicks and tracker of a column of the page.
-COLUMNS = {'UR10e, exact': ('arm', 0, 0.0, 'rigid'), 'UR10e, clicks off': ('arm', 0, OFF, 'rigid'),
-           'UR10e, 64 px': ('arm', SMALL, 0.0, 'rigid'), 'hand, exact': ('hand', 0, 0.0, 'rigid')}
+# Look, size (0: SIZE) and clicks of a column of the page.
+COLUMNS = {'UR10e, exact': ('arm', 0, 0.0), 'UR10e, clicks off': ('arm', 0, OFF),
+           'UR10e, 64 px': ('arm', SMALL, 0.0), 'hand, exact': ('hand', 0, 0.0)}
 LINES = {
     'median_px': 'median error, px', 'within_2px': 'right: within 2 px',
     'wrong_sure': 'wrong by 3 px and said to be seen', 'lost': 'objects lost at the end',
@@ -50,7 +49,8 @@ class Options:
     """
     Options of the command.
 
-    :param real: folder of the labelled films; without it those measured before stay.
+    :param real: folder of the films that docs/results/tracking_labels.json labels;
+        without it those measured before stay.
     :param bags: folder of the recordings; what is there is kept.
     :param out: folder of tracking.json, tracking.png and tracking.md.
     """
@@ -65,25 +65,25 @@ def run(args):
     out = Path(args.out)
     file = out / 'tracking.json'
     rows = json.loads(file.read_text()) if file.exists() else []
-    for look, size, click, tracker in COLUMNS.values():
+    for look, size, click in COLUMNS.values():
         for task in TASKS:
             bag = Path(args.bags, f'{task}_{look}_{SIZE}')
-            if any((row['recording'], row['size'], row['click_px'], row['tracker']) == (
-                    bag.name, size, click, tracker) for row in rows):
+            if any((row['recording'], row['size'], row['click_px']) == (bag.name, size, click)
+                   for row in rows):
                 continue
             collect(bag, CollectConfig(
                 task=task, episodes=EPISODES[look], seed=SEED, image_size=SIZE, look=look,
                 episodes_per_file=5), Engine(workers=1))
-            found, tracks = score(Tracking((str(bag),), size=size, click=click, tracker=tracker))
+            found, tracks = score_bag(bag, size, click)
             rows += found
             write_rows(file, rows)
             if (look, task, size, click) == ('arm', 'push3', 0, OFF):
                 write_atomically(out / 'tracking.png', png_bytes(draw(tracks[:2])))
     if args.real:
-        found, _ = score(Tracking((args.real,), labels=str(out / LABELS)))
-        rows = [row for row in rows if not row['recording'].endswith('.mp4')] + found
+        rows = [row for row in rows if not row['recording'].endswith('.mp4')]
+        rows += score_films(RESULTS / LABELS, args.real)
         write_rows(file, rows)
-    write_atomically(out / 'tracking.md', page(rows, loop(out / 'tracking')))
+    write_atomically(out / 'tracking.md', page(rows, loop(RESULTS / 'tracking')))
 
 
 def page(rows, pushed):
@@ -111,9 +111,9 @@ def pooled(rows, metric):
 
 def of(rows, column):
     """Return the rows of a column."""
-    look, size, click, tracker = COLUMNS[column]
+    look, size, click = COLUMNS[column]
     return rows[rows.recording.str.contains(f'_{look}_') & (rows['size'] == size)
-                & (rows.click_px == click) & (rows.tracker == tracker)]
+                & (rows.click_px == click)]
 
 
 def table(rows):
@@ -125,7 +125,7 @@ def table(rows):
 
 def confidence(rows):
     """Return a table of what is right by confidence."""
-    rows = rows[(rows.metric == 'confidence') & (rows.tracker == 'rigid')]
+    rows = rows[rows.metric == 'confidence']
     lines = []
     for low, mine in rows.groupby('step'):
         right = (mine.value * mine.n).sum() / mine.n.sum()
@@ -135,12 +135,7 @@ def confidence(rows):
 
 
 def loop(folder):
-    """
-    Compare pushing with tracked and with true objects.
-
-    :param folder: --out of `evaluate planning` with METHODS.
-    :return: what the page says of it, by name.
-    """
+    """Compare pushing with tracked and with true objects; return what the page says of it."""
     scenes = [{scene['seed']: scene for scene in json.loads(
         Path(folder, 'planning', f'push2-{name.replace(":", "--")}.json').read_text())['scenes']}
         for name in METHODS]

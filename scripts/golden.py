@@ -31,8 +31,7 @@ from mcap.reader import make_reader  # noqa: E402
 import numpy as np  # noqa: E402
 from safetensors.numpy import load_file  # noqa: E402
 from sim_bridge.simulator import Simulator  # noqa: E402
-from tap_ros.planning.mpc_inputs import Scene  # noqa: E402
-from tap_ros.planning.visual_mpc import Memory, VisualMPC  # noqa: E402
+from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC  # noqa: E402
 from tap_ros.prediction.predictor import SubgoalPredictor  # noqa: E402
 from tap_ros.recording.cache import open_recordings  # noqa: E402
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS  # noqa: E402

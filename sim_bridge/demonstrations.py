@@ -69,14 +69,14 @@ class Stage(Protocol):
 @dataclass(frozen=True)
 class Demonstration:
     """
-    What is recorded of a script.
+    What is recorded of an expert.
 
-    :param episode: without objects and gripper; its actions are what was commanded.
-    :param bottleneck: its first and last frame, by the simulator; None if nothing moved.
+    :param episode: of a script, whose actions are what was commanded, without objects and gripper.
+    :param bottleneck: its first and last frame, by the simulator; None: not known.
     """
 
     episode: Episode
-    bottleneck: tuple[int, int] | None
+    bottleneck: tuple[int, int] | None = None
 
 
 def demonstrate(stage: Stage, seed: int, num_frames: int = 0) -> Demonstration:
@@ -88,35 +88,33 @@ def demonstrate(stage: Stage, seed: int, num_frames: int = 0) -> Demonstration:
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, attempt])
         stage.begin(int(rng.integers(2 ** 31)))
-        frames, commands, hands, places, done = _act_unsteadily(
-            stage, rng, num_frames or MOST_FRAMES)
-        if done and len(frames) >= LEAST_FRAMES:
+        rows, done = _act_unsteadily(stage, rng, num_frames or MOST_FRAMES)
+        if done and len(rows) >= LEAST_FRAMES:
             break
-    count = len(frames)
-    commands[-1][:] = 0
+    frames, commands, hands, places = map(np.stack, zip(*rows))
+    commands[-1] = 0
+    T = len(rows)
     episode = Episode(
-        frames=np.stack(frames), stamps=np.arange(count) * stage.steps * stage.step_ns,
-        actions=np.array(commands, np.float32),
-        grippers=np.full((count, 4), np.nan, np.float32), object_names=(),
-        object_pixels=np.zeros((count, 0, 2), np.float32),
-        object_poses=np.zeros((count, 0, 7)), goal_frame=None,
+        frames=frames, stamps=np.arange(T) * stage.steps * stage.step_ns,
+        actions=commands.astype(np.float32), grippers=np.full((T, 4), np.nan, np.float32),
+        object_names=(), object_pixels=np.zeros((T, 0, 2), np.float32),
+        object_poses=np.zeros((T, 0, 7)), goal_frame=None,
         goal_pixels=np.zeros((0, 2), np.float32), goal_poses=np.zeros((0, 7)),
         task=stage.task_name, seed=seed, outcome='success' if done else 'failure')
-    return Demonstration(episode, find_bottleneck(np.stack(hands), np.stack(places)))
+    return Demonstration(episode, find_bottleneck(hands, places))
 
 
 def to_episode(seen: Sequence[Observation], actions: np.ndarray, goal: Observation, task: str,
-               seed: int, outcome: str, start_ns: int = 0) -> Episode:
+               seed: int, outcome: str) -> Episode:
     """
     Put what was observed and done into an Episode; where objects are is ground truth.
 
     :param seen: T Observations; actions: (T, 4) float32; goal: Observation of the goal.
     :param outcome: 'success', 'failure' or 'interrupted'.
-    :param start_ns: added to the stamps.
     """
     return Episode(
         frames=np.stack([one.image for one in seen]),
-        stamps=np.array([one.stamp_ns + start_ns for one in seen], np.int64),
+        stamps=np.array([one.stamp_ns for one in seen], np.int64),
         actions=actions, grippers=np.stack([one.gripper for one in seen]),
         object_names=seen[0].object_names,
         object_pixels=np.stack([one.object_pixels for one in seen]),
@@ -147,9 +145,9 @@ def find_bottleneck(hands: np.ndarray, places: np.ndarray) -> tuple[int, int] | 
     return (first, last) if 0 < first <= last else None
 
 
-def _act_unsteadily(stage: Stage, rng: np.random.Generator, num_frames: int) -> tuple[
-        list[np.ndarray], list[np.ndarray], list[np.ndarray], list[np.ndarray], bool]:
-    """Return frames, commands, hands and places of one try, and whether it succeeded."""
+def _act_unsteadily(stage: Stage, rng: np.random.Generator,
+                    num_frames: int) -> tuple[list[tuple[np.ndarray, ...]], bool]:
+    """Return frame, command, hand and places at each time of one try; whether it succeeded."""
     steps = stage.steps
 
     def some(frames: tuple[int, int]) -> int:
@@ -162,16 +160,14 @@ def _act_unsteadily(stage: Stage, rng: np.random.Generator, num_frames: int) -> 
     goes_on = some(AFTER)
     by = np.clip(stage.hand() + rng.uniform(DETOUR_LOW, DETOUR_HIGH), *stage.reach)
     detour = DETOUR_FRAMES * steps if rng.random() < DETOUR_SHARE else 0
-    frames, commands, hands, places = [], [], [], []
-    resting, done = 0, False
+    rows, resting, done = list[tuple[np.ndarray, ...]](), 0, False
     action = np.zeros_like(stage.command())
     action[-1] = -1
     for step in range(num_frames * steps):
         if step % steps == 0:
-            frames.append(stage.picture())
-            commands.append(np.zeros(4))  # dx, dy, dz in m till the next picture, opening
-            hands.append(stage.hand().copy())
-            places.append(stage.movable().copy())
+            commanded = np.zeros(4)  # dx, dy, dz in m till the next picture, opening
+            rows.append((
+                stage.picture(), commanded, stage.hand().copy(), stage.movable().copy()))
         resting = pauses.get(step, resting)
         if resting:
             resting -= 1
@@ -186,10 +182,10 @@ def _act_unsteadily(stage: Stage, rng: np.random.Generator, num_frames: int) -> 
             action[:3] = speed * action[:3] + unsteady
         action = np.clip(action, -1, 1)
         stage.act(action)
-        commands[-1][:3] += stage.scale * action[:3]
-        commands[-1][3] = (1 - action[-1]) / 2
+        commanded[:3] += stage.scale * action[:3]
+        commanded[3] = (1 - action[-1]) / 2
         done = done or stage.succeeds()
         goes_on -= done
         if not goes_on:
             break
-    return frames, commands, hands, places, done and not goes_on
+    return rows, done and not goes_on

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from sim_bridge.demonstrations import demonstrate, Demonstration
 from sim_bridge.gym_world import GymWorld
-from sim_bridge.world.camera import Camera, drawing
+from sim_bridge.world.camera import Camera, Renderer
 from tap_ros.base.contract import (
     CONTROL_PERIOD,
     ROBOT_MASK_ARM,
@@ -60,11 +60,7 @@ class MetaWorld(GymWorld):
             eye = model.cam(name)
             eye.pos[:], eye.fovy[:] = np.array(camera.position) * TURN + ORIGIN, camera.fovy
             eye.quat[:] = replace(camera, turn=camera.turn + np.pi).quaternion
-        model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0  # 7 ms instead of 300
-        with drawing():
-            self._renderer = mujoco.Renderer(model, image_size, image_size)
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._renderer = Renderer(model, image_size, image_size)
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # the goal is drawn as a site
         self._labels = _labels(model)
@@ -116,12 +112,7 @@ class MetaWorld(GymWorld):
 
     def draw(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the picture, without the marker of the goal, and the robot mask."""
-        image, renderer = self._draw('corner'), self._renderer
-        renderer.enable_segmentation_rendering()
-        try:
-            ids = renderer.render()
-        finally:
-            renderer.disable_segmentation_rendering()
+        image, ids = self._draw('corner'), self._renderer.numbers()
         geom = ids[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
         return image, np.where(geom, self._labels[ids[..., 0]], ROBOT_MASK_FREE).astype(np.uint8)
 
@@ -223,25 +214,20 @@ def _reset_mocap_welds(self: Any) -> None:
     self.model.eq_data[welds, :11] = (0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5)
 
 
-def _below(model: mujoco.MjModel, root: str) -> set[int]:
-    """Return a body and those that hang on it."""
-    found = {mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, root)}
-    for body in range(1, model.nbody):  # parents come first
-        if model.body_parentid[body] in found:
-            found.add(body)
-    return found
-
-
 def _labels(model: mujoco.MjModel) -> np.ndarray:
     """Return what each geom is in a robot mask, uint8 (G,)."""
-    hand, arm = _below(model, 'hand'), _below(model, 'base')
-    return np.array([ROBOT_MASK_HAND if body in hand else ROBOT_MASK_ARM if body in arm
-                     else ROBOT_MASK_FREE for body in model.geom_bodyid], np.uint8)
+    robot, hand = model.body_rootid == model.body('base').rootid, model.body('hand').id
+    labels = np.where(robot, ROBOT_MASK_ARM, ROBOT_MASK_FREE).astype(np.uint8)
+    labels[hand] = ROBOT_MASK_HAND
+    for body in range(hand + 1, model.nbody):  # parents come first
+        if labels[model.body_parentid[body]] == ROBOT_MASK_HAND:
+            labels[body] = ROBOT_MASK_HAND
+    return labels[model.geom_bodyid]
 
 
 def _movable(model: mujoco.MjModel) -> np.ndarray:
     """Return where positions of what is not the robot stand in qpos, int (Q,)."""
-    robot, free = _below(model, 'hand') | _below(model, 'base'), mujoco.mjtJoint.mjJNT_FREE
-    joints = zip(model.jnt_bodyid, model.jnt_type, model.jnt_qposadr)
-    return np.concatenate([np.arange(3 if kind == free else 1) + first
-                           for body, kind, first in joints if body not in robot])
+    free = model.body_rootid[model.jnt_bodyid] != model.body('base').rootid
+    return np.concatenate([
+        np.arange(3 if kind == mujoco.mjtJoint.mjJNT_FREE else 1) + first
+        for kind, first in zip(model.jnt_type[free], model.jnt_qposadr[free])])

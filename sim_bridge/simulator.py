@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The MuJoCo table with its tasks, a World: reset, step, observe. Knows nothing of ROS."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.tasks.tasks import get_task, sample_scene, task_names
+from sim_bridge.demonstrations import Demonstration, to_episode
+from sim_bridge.tasks.tasks import get_task, run_episode, sample_scene, task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, GRIP_SPREAD
 from sim_bridge.world.table import lifted, Table
 from sim_bridge.world_protocol import Observation
@@ -17,21 +18,28 @@ from tap_ros.robots.arm import DEFAULT_ARM
 
 class Simulator(Table):
     """
-    The World 'mujoco_table'.
+    The World 'mujoco_table': an arm with a gripper, K objects, a camera, a goal.
 
-    :param task: name of a task, see tasks.task_names; the others: see Table.
-    :raises SceneError: for an unknown task, and as Table.
+    Everything follows from seeds and actions, to the bit. Observations have shapes and units as
+    world_protocol.Observation says; it belongs to the thread of its first reset, which draws.
+
+    :param task: name of a task, such as 'push2'; see tasks.task_names.
+    :param image_size: width and height of the pictures, 16 to 1024 pixels.
+    :param look: 'hand' or 'arm', what pictures show of the arm.
+    :param appearance: of table, light and camera, one of looks.CHOICES; 'random': drawn from the
+        seed of each scene.
+    :param arm: name of an arm, such as 'ur10e'.
+    :ivar scene: the TaskScene of the last reset.
+    :raises ConfigError: for an unknown arm.
+    :raises SceneError: for an unknown task, look or appearance and a bad size; by reset also when
+        nothing can be rendered.
     """
 
     def __init__(self, task: str = 'push2', image_size: int = 64, look: str = DEFAULT_LOOK,
                  appearance: str = 'usual', arm: str = DEFAULT_ARM) -> None:
         self.task = get_task(task)
+        self.task_name = self.task.name
         super().__init__(image_size, self.task.gripping, look, appearance, arm)
-
-    @property
-    def task_name(self) -> str:
-        """Return the name of the task."""
-        return self.task.name
 
     def reset(self, seed: int) -> Observation:
         """
@@ -79,8 +87,9 @@ class Simulator(Table):
         poses[:, :2] = places
         with self.unmoved():
             self.place(poses, self.target)
-            for first, second in self._overlaps():
-                if {first, second} <= set(self.object_names):
+            for geoms, distance in zip(self.data.contact.geom, self.data.contact.dist):
+                first, second = (self.model.body(k).name for k in self.model.geom_bodyid[geoms])
+                if distance < 0 and {first, second} <= set(self.object_names):
                     raise SceneError(f'{first} and {second} would overlap; put them farther apart')
         self._show_goal(poses, None)
 
@@ -108,17 +117,28 @@ class Simulator(Table):
         """Return 'success' or 'failure', see Task.succeeds."""
         return 'success' if self.task.succeeds(self) else 'failure'
 
+    def demonstrate(self, seed: int, num_frames: int = 0, timing: str = 'natural',
+                    misses: float = 0.0) -> Demonstration:
+        """
+        Let the expert of the task act in the scene of a seed.
+
+        The goal of the episode is the one that it reached: a picture of where the objects ended,
+        with the arm elsewhere, as a person would photograph a goal; after a grasp, whose object
+        the arm may still hold, the last frame itself. The expert's own goal, from which the
+        outcome follows, is drawn again from the seed by tasks.sample_scene.
+
+        :param num_frames: and the others: see tasks.DemonstrationOptions.
+        """
+        seen, actions, outcome = run_episode(self, seed, num_frames, timing, misses)
+        goal = seen[-1]
+        if self.task.photographed:
+            goal = self.photograph(goal.object_poses)
+        return Demonstration(to_episode(seen, actions, goal, self.task.name, seed, outcome))
+
     def _show_goal(self, poses: np.ndarray, gripper: np.ndarray | None) -> None:
         """Take the pictures of a goal, (K, 7) and as Task.goal_gripper."""
         self._goal = [self.photograph(poses, gripper, hide_arm) for hide_arm in (False, True)]
         self.goal_poses = self.goal().object_poses
-
-    def _overlaps(self) -> Iterator[tuple[str, str]]:
-        """Yield the names of bodies that reach into each other."""
-        for geoms, distance in zip(self.data.contact.geom, self.data.contact.dist):
-            if distance < 0:
-                first, second = self.model.geom_bodyid[geoms].tolist()
-                yield self.model.body(first).name, self.model.body(second).name
 
     def _check_places(self, places: np.ndarray) -> None:
         """Raise SceneError for a task without pushing, another shape, and places out of reach."""

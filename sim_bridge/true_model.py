@@ -10,7 +10,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from sim_bridge.simulator import Simulator
-from sim_bridge.world.table import OBJECT_QPOS_START, ramp_controls, SUBSTEPS
+from sim_bridge.world.table import objects_in, ramp_controls, SUBSTEPS
 from sim_bridge.world_protocol import clip_moves
 from tap_ros.base.errors import ConfigError
 from tap_ros.planning.forward_model import LearnedForwardModel
@@ -39,11 +39,11 @@ class TrueModel:
         """
         Take the table of a learned model's weights.
 
-        :raises ConfigError: without a simulator, that is, other than in an evaluation.
+        :raises ConfigError: without a simulator, that is, other than in an experiment.
         """
         if simulator is None:
-            raise ConfigError("forward model 'true': needs a simulator to roll out in; use it in "
-                              'evaluate planning, or make TrueModel(table, simulator)')
+            raise ConfigError("forward model 'true': needs a simulator to roll out in; make "
+                              'TrueModel(table, simulator)')
         return cls(LearnedForwardModel.load(path, device).table, simulator)
 
     def begin(self, image: torch.Tensor, gripper: torch.Tensor,
@@ -68,8 +68,7 @@ class TrueModel:
         states, _ = self._rollout.rollout(
             model, mujoco.MjData(model), np.tile(state, (len(steps), 1)), controls)
         for t in range(every, steps.shape[1] + 1, every):
-            poses = states[:, t * SUBSTEPS - 1, 1 + OBJECT_QPOS_START:1 + model.nq]
-            places = poses.reshape(len(steps), -1, 7)[..., :3]
+            places = objects_in(states[:, t * SUBSTEPS - 1], model)[..., :3]
             pixels = self._simulator.camera.project(places).astype(np.float32)  # (N, K, 2)
             reached = self.table.seed_maps(
                 torch.from_numpy(pixels).to(self.table.device).view(-1, 2))

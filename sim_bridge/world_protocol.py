@@ -37,10 +37,9 @@ class World(Protocol):
 
     Some worlds can do more; who needs that asks by `ability`, which raises SceneError if the
     world lacks the method. The MuJoCo table, simulator.Simulator, has all of them:
-    `observer_picture()`, `move_goal(names, pixels)`. Others may have
+    `observer_picture()`, `move_goal(names, pixels)`, and for `collect`
     `demonstrate(seed, num_frames)`, which lets an expert act and returns a
-    demonstrations.Demonstration, for `collect`. Keyword arguments look=, appearance= and arm= are
-    the table's, too.
+    demonstrations.Demonstration. Keyword arguments look=, appearance= and arm= are the table's.
 
     :ivar task_name: of the present task.
     :ivar arm: the Arm that is seen, None where it is not known.
@@ -61,7 +60,12 @@ class World(Protocol):
     def camera_pose(self) -> np.ndarray | None: ...
 
     def reset(self, seed: int) -> Observation:
-        """Begin the scene of a seed, a non-negative integer, with its goal."""
+        """
+        Begin the scene of a seed, with its goal.
+
+        :param seed: integer from 0 on.
+        :raises SceneError: for another seed, and where a scene cannot be made or drawn.
+        """
 
     def step(self, action: ArrayLike) -> Observation:
         """

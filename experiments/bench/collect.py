@@ -32,12 +32,7 @@ class Options:
 
 
 def run(args):
-    """Collect into a temporary folder and print where the time went."""
-    measure(args)
-
-
-def measure(args):
-    """Return the rows of this benchmark, which it prints."""
+    """Collect into a temporary folder and print where the time went; return rows."""
     with tempfile.TemporaryDirectory() as folder:
         config = CollectConfig(task=args.task, episodes=args.episodes, episodes_per_file=5)
         result = collect(Path(folder) / 'bench', config, Engine(workers=args.workers))

@@ -33,7 +33,7 @@ def run(args):
     for name in PARTS:
         print(f'== bench {name.split(".")[-1]}', flush=True)
         part = importlib.import_module(f'experiments.bench.{name}')
-        rows += part.measure(part.Options())
+        rows += part.run(part.Options())
     write_atomically(args.out, json.dumps({
         'command': 'make bench', 'date': time.strftime('%Y-%m-%d'),
         'machine': f'{len(os.sched_getaffinity(0))} cores, {processor()}',

@@ -7,6 +7,7 @@ import time
 
 from experiments.bench.mppi import mppi
 from experiments.bench.rows import Row, show
+from experiments.planning.methods import FIRST_SCENE, with_samples
 import numpy as np
 from sim_bridge.simulator import Simulator
 from tap_ros.base.contract import CLEAR
@@ -15,9 +16,8 @@ from tap_ros.base.options import ShippedFile
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.images.pixels import to_float
 from tap_ros.planning.action_sequences import HORIZON
-from tap_ros.planning.mpc_config import FIRST_SCENE, PRESETS, with_preset, with_samples
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 import torch
 from torch.profiler import profile, ProfilerActivity
@@ -44,12 +44,7 @@ class Options:
 
 
 def run(args):
-    """Print the times of plans of each preset, and what the solvers find."""
-    measure(args)
-
-
-def measure(args):
-    """Return the rows of this benchmark, which it prints."""
+    """Print the times of plans of each preset, and what the solvers find; return rows."""
     simulator = Simulator('push2')
     seen = simulator.reset(FIRST_SCENE)
     goal = simulator.goal().object_pixels
@@ -157,12 +152,7 @@ def compare_solvers(args):
 
 
 def plans(args, configs, scenes):
-    """
-    Plan in turns, after a plan of each to warm up.
-
-    :param scenes: (seed, Scene, goal pixels) of each.
-    :return: for each config (costs, times in ms), of every scene.
-    """
+    """Plan each (seed, Scene, pixels) in turns; return for each config (costs, times in ms)."""
     planners = [VisualMPC.load(args.weights, config, args.device) for config in configs]
     found = [([], []) for _ in planners]
     for number, (seed, scene, pixels) in enumerate((scenes[0], *scenes)):

@@ -44,12 +44,7 @@ class Options:
 
 
 def run(args):
-    """Print frames per second, and how long a bag of JPEG pictures takes to open."""
-    measure(args)
-
-
-def measure(args):
-    """Return the rows of this benchmark, which it prints."""
+    """Print frames per second, and how long a bag of JPEG pictures takes to open; return rows."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for compression in ('none', 'zstd'):

@@ -7,25 +7,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Row:
-    """
-    One speed, and the ratio to something that was measured in the same run.
+    """One speed, and the ratio to something that was measured in the same run."""
 
-    :param what: was measured.
-    :param here: the number with its unit.
-    :param ratio: of it to `to`.
-    :param to: what else was measured.
-    :param aim: in words; '': none was set.
-    :param reached: whether it is.
-    :param limit: what takes the time.
-    """
-
-    what: str
-    here: str
-    ratio: float
-    to: str
-    aim: str = ''
-    reached: bool = True
-    limit: str = ''
+    what: str  # was measured
+    here: str  # the number with its unit
+    ratio: float  # of it to `to`
+    to: str  # what else was measured
+    aim: str = ''  # in words; '': none was set
+    reached: bool = True  # whether it is
+    limit: str = ''  # what takes the time
 
     @property
     def cells(self):

@@ -13,8 +13,8 @@ import time
 from typing import Annotated
 
 from experiments.bench.rows import Row, show
+from experiments.paper.methods import method_fields
 from tap_ros.base.options import Bags
-from tap_ros.training.methods import method_fields
 from tap_ros.training.predictor import train
 from tap_ros.training.predictor_config import TrainingConfig
 from tap_ros.weights.devices import has_bfloat16, pick_device, pick_precision
@@ -58,24 +58,14 @@ class Options:
 
 @dataclass(frozen=True)
 class Cost:
-    """
-    What a step of training takes.
-
-    :param seconds: time that passes.
-    :param cpu_seconds: time of all cores together.
-    """
+    """Seconds that pass in a step of training, and those of all cores together."""
 
     seconds: float
     cpu_seconds: float
 
 
 def run(args):
-    """Train in each way for some steps in a temporary folder, and print how fast that was."""
-    measure(args)
-
-
-def measure(args):
-    """Return the rows of this benchmark, which it prints."""
+    """Train in each way for some steps, and print how fast that was; return rows."""
     device = pick_device(args.device)
     if args.threads:
         torch.set_num_threads(args.threads)
@@ -104,13 +94,7 @@ def measure(args):
 
 
 def time_step(config, steps):
-    """
-    Time a step of training, all that belongs to it included.
-
-    :param config: TrainingConfig, of a run that has not begun.
-    :param steps: how many to average over, after as many to warm up.
-    :return: Cost.
-    """
+    """Time a step of training, all that belongs to it included, mean of so many after as many."""
     times = {}
 
     def note(step):

@@ -34,12 +34,7 @@ class Options:
 
 
 def run(args):
-    """
-    Do what the command line says.
-
-    :return: exit status: 0, or 1 if a run failed.
-    :raises ConfigError: if no run fits.
-    """
+    """Do what the command line says; return 1 if a run failed. ConfigError if no run fits."""
     runs, failed = [run for run in paper_runs() if not args.only or any(
         fnmatch(run.name, pattern) for pattern in args.only)], {}
     if not runs:

@@ -40,12 +40,7 @@ def to_png(figure):
 
 
 def timing(rows):
-    """
-    Draw the bottleneck frequency of methods over when the bottleneck comes.
-
-    :param rows: of rows.as_frame.
-    :return: bytes of a PNG, or None without such rows.
-    """
+    """Draw the bottleneck frequency over when it comes, of as_frame; None without such rows."""
     rows = rows[(rows['metric'] == 'bottleneck_frequency_2px') & rows['task'].isin(TIMED_TITLES)]
     if not len(rows):
         return None

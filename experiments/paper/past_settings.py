@@ -4,7 +4,7 @@
 
 from dataclasses import asdict
 
-from tap_ros.training.methods import method_fields
+from experiments.paper.methods import method_fields
 from tap_ros.training.predictor_config import TrainingConfig
 
 # Settings of earlier versions, and the value that they have now, or at which they did nothing.
@@ -16,12 +16,7 @@ _GONE = {'bell_edge': 2 / 3, 'changed_weight': 0.0, 'match_temperature': 0.0, 'm
 
 
 def todays_settings(settings):
-    """
-    Return settings of a training, of any version, by the fields of today.
-
-    :param settings: as in a file of results.
-    :return: dict; what today's version cannot do keeps its old name.
-    """
+    """Return settings of any version by today's fields; what is gone keeps its name."""
     gone = {**_GONE, 'image_topic': '', 'detach_recursion': settings.get('recursion', 1) > 1}
     kept = {name: value for name, value in settings.items()
             if name != 'method' and (name not in gone or value != gone[name])}

@@ -12,7 +12,7 @@ from experiments.paper.figures import INK, new_figure, to_png
 from experiments.paper.runs import OURS, PaperRun, SCALE
 import numpy as np
 from tap_ros.base.files import write_atomically
-from tap_ros.evaluation.samples import draw_latents
+from tap_ros.evaluation.prediction import draw_latents
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
@@ -35,9 +35,6 @@ def write_picture(places, runs):
 
     One that is there stays where weights of a method, or the recording that they were scored on,
     are not at hand.
-
-    :param places: sweep.Places.
-    :param runs: dicts as results.load_runs returns them.
     """
     by_name = {run['name']: run for run in runs}
     shown = {method: PaperRun(TASK, MODE, method[0], variant=method[1]).name for method in METHODS}

@@ -17,13 +17,7 @@ _KEYS = {'name', 'task', 'mode', 'method', 'new_pixels', 'seed', 'scale', 'comma
 
 
 def load_runs(folder):
-    """
-    Read what the finished runs left; methods are named as runs.label has it.
-
-    :param folder: with a subfolder for each scale, and in it a JSON file for each run.
-    :return: list of dicts, by scale and name.
-    :raises ConfigError: if a file is damaged or lacks something; the message names it.
-    """
+    """Read the files SCALE/RUN.json; methods are named as runs.label has it."""
     runs = []
     for path in sorted(Path(folder).glob('*/*.json')):
         try:
@@ -42,13 +36,10 @@ def load_runs(folder):
 
 def on_same_episodes(runs):
     """
-    Leave out runs that were scored on other episodes than most of their task, mode and scale.
+    Return the runs that were scored on the episodes of most of their kind, and the others.
 
     What copying an input costs in each tells them apart; the hash of a recording also depends on
     the last digits of joint positions, in which machines differ.
-
-    :param runs: of load_runs.
-    :return: (runs to compare, runs left out).
     """
     counts = {}
     for run in runs:
@@ -63,13 +54,7 @@ def on_same_episodes(runs):
 
 
 def write_results(places):
-    """
-    Write prediction.csv, the plot of timing, and a picture where weights are at hand.
-
-    :param places: sweep.Places.
-    :return: rows of prediction.csv.
-    :raises ConfigError: if there are no finished runs, or one cannot be read.
-    """
+    """Write prediction.csv, the plot of timing, and a picture where weights are at hand."""
     folder = Path(places.results)
     loaded = load_runs(folder / 'runs')
     if not loaded:

@@ -29,28 +29,16 @@ COLUMNS = ['task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n'
 
 @dataclass(frozen=True)
 class Group:
-    """
-    Runs that differ by the seed only; all scored on the same N episodes.
+    """Runs that differ by the seed only; all scored on the same N episodes."""
 
-    :param key: dict of task, mode, method, scale and, where something was trained, new_pixels.
-    :param scores: dict of float arrays (S, N), a row for each run; NaN where undefined.
-    :param runs: their names, with blanks between.
-    :param of: for the best of 100, the method that was sampled from.
-    """
-
-    key: dict
-    scores: dict
-    runs: str
-    of: str = ''
+    key: dict  # task, mode, method, scale and, where something was trained, new_pixels
+    scores: dict  # float arrays (S, N), a row for each run; NaN where undefined
+    runs: str  # their names, with blanks between
+    of: str = ''  # for the best of 100, the method that was sampled from
 
 
 def group_runs(runs):
-    """
-    Put runs together that differ by the seed only, and add copying and the best of 100.
-
-    :param runs: dicts as results.load_runs returns them, on one recording per task and scale.
-    :return: list of Group.
-    """
+    """Put runs of load_runs together that differ by the seed only; add copying and best of 100."""
     sorted_runs = {}
     for run in sorted(runs, key=lambda run: (run['name'], run['seed'])):
         key = tuple(run[name] for name in ('task', 'mode', 'method', 'scale', 'new_pixels'))
@@ -98,19 +86,12 @@ def _group(key, runs, part, of=''):
 
 def make_rows(groups):
     """
-    Compute every number of the results.
+    Compute every number of the results, a dict of COLUMNS each.
 
-    :param groups: of group_runs.
-    :return: list of dicts: task, mode, method, metric, value, ci_low, ci_high, n, seeds, scale,
-        runs; new_pixels where something was trained; baseline for numbers that compare, of for
-        the best of 100.
-        Bottlenecks are scored without new pixels only, which have no origin to follow (App. E).
-        min_l1 is the per-pixel mean on [0, 1], match_step counts frames from the start picture
-        (0), bottleneck_frequency and gains are shares; target_bottleneck_frequency is that of the
-        true frames at a fixed time. shows_both is the share of predictions that show the hand and
-        the objects (shown.ShownScorer). Of those whose match has the objects PLACE of their way
-        behind them, pick_after_place is the share of which the next level's match has them PICK
-        of it behind them.
+    Bottlenecks are scored without new pixels only, which have no origin to follow (App. E). min_l1
+    is the per-pixel mean on [0, 1], match_step counts frames from the start picture (0), all else
+    are shares. Of those whose match has the objects PLACE of their way behind them,
+    pick_after_place is the share of which the next level's match has them PICK of it behind them.
     """
     rows = [_row(group, metric, lambda array, statistic=statistic: statistic(array, -1).mean(0),
                  values, by_seed=' '.join(f'{x:.6g}' for x in statistic(values, -1)))
@@ -168,24 +149,16 @@ def _row(group, metric, statistic, *arrays, **more):
 
 
 def relative_gain(error, baseline):
-    """
-    Compute by which share the mean error is below the baseline's.
-
-    :param error: (S, ..., N).
-    :param baseline: (S', ..., N).
-    :return: (...), 0.25 is a quarter less.
-    """
+    """Compute by which share the mean error (S, ..., N) is below the baseline's."""
     return 1 - error.mean((0, -1)) / baseline.mean((0, -1))
 
 
 def find_baseline(group, groups):
     """
-    Find the fixed-time predictor that a method is to be compared with: fix in the same setting.
+    Return the Group of fix in the same setting, or None.
 
     A method is compared with fix of the same network; without GAN, with fix-wo-gan where that was
     run; a variant with fix of that variant where that was run.
-
-    :return: Group or None.
     """
     name = group.key['method']
     wo_gan = '-wo-gan' in name or (re.search(r'-vae(?!-gan)', name) and BEST not in name)
@@ -261,13 +234,7 @@ def _gain_at_match_step(*arrays):
 
 
 def lower_hull(at, points):
-    """
-    Interpolate linearly between those two points that give the lowest value.
-
-    :param at: (...), positions.
-    :param points: list of (position (...), value (...)).
-    :return: (...), NaN beyond the outermost positions.
-    """
+    """Interpolate between those two of (position, value) that give the lowest value; else NaN."""
     lowest = np.full(np.shape(at), np.inf)
     for x, y in points:
         for x2, y2 in points:
@@ -280,14 +247,11 @@ def lower_hull(at, points):
 
 def best_of_name(method):
     """
-    Name the best of 100 samples of a method.
+    Name the best of 100 samples of a method with a VAE.
 
     The paper's genmin + vae is its Eq. 10, with GAN: genmin-vae-gan here. So its samples are those
     of genmin-vae-best-of-100; those of the CVAE without GAN (Eq. 9), genmin-vae here, are of
     genmin-vae-wo-gan-best-of-100.
-
-    :param method: name of a method with a VAE.
-    :return: for example 'genmin-vae-best-of-100', with +relative or the like at its end.
     """
     stem, plus, suffix = method.partition('+')
     stem = stem.removesuffix('-gan') if stem.endswith('-vae-gan') else f'{stem}-wo-gan'
@@ -307,10 +271,5 @@ def network_of(method):
 
 
 def as_frame(rows):
-    """
-    Make a table of rows, for all that shows them.
-
-    :param rows: of make_rows.
-    :return: DataFrame; new_pixels is NA for copying.
-    """
+    """Make a DataFrame of rows; new_pixels is NA for copying."""
     return pd.DataFrame(rows, columns=COLUMNS).astype({'new_pixels': 'boolean'})

@@ -5,9 +5,9 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from experiments.paper.methods import method_fields
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED, TIMED
 from sim_bridge.tasks.tasks import get_task
-from tap_ros.training.methods import method_fields
 from tap_ros.training.predictor_config import TrainingConfig
 
 SINGLE = ('grasp', 'pick_place', 'push2')  # the tasks of Table 1
@@ -66,38 +66,21 @@ _FINE_TUNED = {'goal_picture': 'mixed', 'start_crop': 0.3}  # as those were trai
 
 
 def label(method, variant='', recursion=1):
-    """
-    Name a method in results: genmin+skips is a variant, genmin-r2 was trained for recursion.
-
-    :param method: as for training.
-    :param variant: one of VARIANTS.
-    :param recursion: levels of Eq. 3 in training.
-    :return: for example 'genmin+progress+skips'.
-    """
+    """Name a method in results: genmin+skips is a variant, genmin-r2 was trained for recursion."""
     return method + variant + (f'-r{recursion}' if recursion > 1 else '')
 
 
 @dataclass(frozen=True)
 class PaperRun:
-    """
-    One training and its evaluation.
+    """One training and its evaluation."""
 
-    :param task: the recording, of recordings.RECORDINGS.
-    :param mode: 'bidirectional' or 'forward'.
-    :param method: see prediction.methods.
-    :param new_pixels: whether the network may paint; if not, it has object maps.
-    :param seed: of the training.
-    :param recursion: levels of Eq. 3.
-    :param variant: one of VARIANTS, other settings than the method's own.
-    """
-
-    task: str
-    mode: str
-    method: str
-    new_pixels: bool = True
-    seed: int = 0
-    recursion: int = 1
-    variant: str = ''
+    task: str  # the recording, of recordings.RECORDINGS
+    mode: str  # 'bidirectional' or 'forward'
+    method: str  # see prediction.methods
+    new_pixels: bool = True  # whether the network may paint; if not, it has object maps
+    seed: int = 0  # of the training
+    recursion: int = 1  # levels of Eq. 3
+    variant: str = ''  # one of VARIANTS, other settings than the method's own
 
     @property
     def name(self):
@@ -128,13 +111,7 @@ class PaperRun:
         return f'python -m experiments paper --only {self.name}'
 
     def config(self, recordings, runs):
-        """
-        Say how to train.
-
-        :param recordings: folder with the recordings.
-        :param runs: folder of all runs.
-        :return: TrainingConfig.
-        """
+        """Return the TrainingConfig, by the folders of recordings and of all runs."""
         pushing = get_task(RECORDINGS[self.task].task).kind == 'push'
         settings = {**_SMALL, **_PAPER, **({} if pushing else _GRIPPING)}
         method = method_fields(self.method)

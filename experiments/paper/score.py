@@ -8,14 +8,19 @@ import time
 from experiments.paper.runs import SCALE
 import numpy as np
 from tap_ros.base.errors import ConfigError
-from tap_ros.evaluation.bottleneck import MIN_MOTION, target_bottlenecks
+from tap_ros.evaluation.bottleneck import (
+    can_be_bottleneck,
+    context_pixels,
+    least_sum,
+    MIN_MOTION,
+)
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training.batches import make_batch, Sampling
+from tap_ros.training.batches import fixed_time, make_batch, Sampling
 from tap_ros.training.split import split_episodes
 from tap_ros.weights import find_predictor
 from tap_ros.weights.devices import pick_device
@@ -29,14 +34,9 @@ _DIGITS = 5
 
 def score(run, config, weights, places):
     """
-    Score a trained run on the episodes of its task that training held out.
+    Score a trained PaperRun on the episodes of its task that training held out.
 
-    :param run: PaperRun.
-    :param config: its TrainingConfig.
-    :param weights: path of the weights.
-    :param places: Places.
     :return: dict for a JSON file: what the run was, and a number for each held-out episode.
-    :raises ConfigError: if no episode was held out.
     """
     network, about = load_network(weights, pick_device(config.device))
     store = open_recordings(list(config.recordings), progress=False)
@@ -55,7 +55,7 @@ def score(run, config, weights, places):
             for level in score_recursion(network, store, held_out)]
     if config.loss == 'fix' and config.mode == 'bidirectional':
         scores['target_bottleneck'] = _rounded_list(
-            target_bottlenecks([store[i] for i in held_out], config.fraction, 'last'))
+            [target_bottleneck(store[i], config.fraction) for i in held_out])
     if network.config.latent_size:
         samples = _rounded(score_samples(network, store, held_out))
         scores['best_of_100'] = {name: values for name, values in samples.items()
@@ -77,11 +77,7 @@ def score(run, config, weights, places):
 
 
 def _shifted(run, network, store, held_out, places):
-    """
-    Score on other looks of scenes, and on goal pictures with the arm elsewhere.
-
-    :return: the scores, and the hashes of the recordings of other looks, by their names.
-    """
+    """Score on other looks of scenes, and with the arm elsewhere; return hashes, too."""
     scores, hashes = {'arm_elsewhere': evaluate(
         network, store, [i for i in held_out if store[i].goal_frame is not None],
         goal_picture='recorded')}, {}
@@ -102,17 +98,19 @@ def _rounded_list(values):
             for x in values]
 
 
+def target_bottleneck(episode, fraction):
+    """Score the true frame at a fixed time, px: whether that time is a bottleneck by itself."""
+    pixels, end = context_pixels(episode, 'last'), len(episode.frames) - 1
+    if not can_be_bottleneck(pixels):
+        return np.nan
+    target = fixed_time(fraction, end, 1, end - 1)
+    gaps = torch.from_numpy(np.linalg.norm(episode.object_pixels[target] - pixels, axis=-1))
+    return least_sum(gaps[:1], gaps[1:]).item()
+
+
 @torch.inference_mode()
 def score_recursion(network, store, episodes):
-    """
-    Measure each level of recursion (Eq. 3, Fig. 7); the first is the prediction itself.
-
-    :param network: Predictor in eval mode, without z, with start and goal as context.
-    :param store: the EpisodeStore.
-    :param episodes: indices of at least one episode, each of at least 3 frames.
-    :return: list of dicts, the first level first: min_l1, (N,), error against the best matching
-        frame between start and goal; way, (N,), see way_behind, in that frame.
-    """
+    """Return for each level of recursion (Eq. 3, Fig. 7) lists of min_l1 and of way_behind."""
     device = next(network.parameters()).device
     levels = [{'min_l1': [], 'way': []} for _ in range(LEVELS)]
     for at in range(0, len(episodes), _BATCH):
@@ -131,13 +129,7 @@ def score_recursion(network, store, episodes):
 
 
 def way_behind(pixels, time):
-    """
-    Say which share of their way the moved objects of an episode have behind them.
-
-    :param pixels: (T, K, 2), (u, v) of the objects; NaN where unknown.
-    :param time: number of a frame.
-    :return: float 0..1, the mean over the objects that move; NaN where none does.
-    """
+    """Say which share of their way the moved objects of pixels (T, K, 2) have behind them."""
     way = np.linalg.norm(pixels[-1] - pixels[0], axis=-1)
     behind = np.linalg.norm(pixels[time] - pixels[0], axis=-1)[way >= MIN_MOTION]
     moved = np.minimum(behind / way[way >= MIN_MOTION], 1)

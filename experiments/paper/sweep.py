@@ -61,15 +61,7 @@ def find_result(run, places):
 
 
 def sweep(runs, places, engine=LOCAL):
-    """
-    Do all runs that are not done.
-
-    :param runs: PaperRuns, the most important first.
-    :param places: Places.
-    :param engine: Engine.
-    :return: dict from the names of runs that failed to the reasons.
-    :raises TapError: if a recording cannot be collected.
-    """
+    """Do all PaperRuns that are not done, in their order; return {name: why it failed}."""
     waiting = [run for run in runs if find_result(run, places) is None]
     for name in dict.fromkeys(name for run in waiting for name in (run.task, *run.shifted)):
         folder = places.recording(name)

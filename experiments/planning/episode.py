@@ -17,9 +17,8 @@ from tap_ros.images.robot_mask import FreeView, trained_robot_mask
 from tap_ros.planning.action_sequences import DOWN
 from tap_ros.planning.cost import BLOCKED
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
-from tap_ros.planning.visual_mpc import SHORT
+from tap_ros.planning.reach import End, Observation, Reach, ReachConfig, SelectTargets
+from tap_ros.planning.visual_mpc import Memory, Scene, SHORT
 
 
 @dataclass
@@ -64,15 +63,10 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
     """
     Push the objects of one scene.
 
-    :param simulator: Simulator; reset here.
     :param mpc: VisualMPC, with the forward model that the method names.
-    :param method: methods.Method.
-    :param step_budget: control periods at most.
-    :param seed: of the scene, the planner and the predictor.
     :param predictor: SubgoalPredictor, for methods that predict.
     :param reached: px, mean over objects; nearer than this is there. 0: never.
     :return: PlannedEpisode.
-    :raises ConfigError: when the predictor is missing.
     """
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
@@ -95,15 +89,15 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
     while method.base != 'nothing' and not refused:
         tracked.append(seen.object_pixels)
         shown, start_picture = (each.update(seen.image, seen.robot_mask) for each in (view, asked))
-        looked = Seen(shown, seen.gripper, tuple(seen.object_names), seen.object_pixels,
-                      seen.stamp_ns, states=states)
+        looked = Observation(shown, seen.gripper, tuple(seen.object_names), seen.object_pixels,
+                             seen.stamp_ns, states=states)
         answer = reach.step(looked)
-        while isinstance(answer, Aim):
+        while isinstance(answer, SelectTargets):
             pictures = start_picture, asked.fill(goal.image, goal.robot_mask), shown
             targets, found = make_targets(
                 simulator, mpc, method, seen, goal, predictor, seed, pictures)
             subgoals += found
-            reach.head_for(targets)
+            reach.set_targets(targets)
             answer = reach.step(looked)
         if isinstance(answer, End):
             aborted = answer.message if answer.outcome == 'aborted' else ''
@@ -133,8 +127,6 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=(
     """
     Decide what is planned to from what is seen, at the start of each round.
 
-    :param mpc: VisualMPC, which chooses among samples.
-    :param seen: Observation of now; goal: of the goal.
     :param pictures: for methods that predict, uint8 (H, W, 3), filled as each network was
         trained: of the start and of the goal for the predictor, of now for the planner's model.
     :return: list of Target, the goal last, and the list of the Subgoals that were predicted.
@@ -147,7 +139,8 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=(
             first, last_picture, start, end, num_samples=method.samples,
             recursion_depth=method.recursion, seed=seed)
         subgoals = choose_sample(
-            mpc, Scene(now, seen.gripper, start), end, found, seed)
+            mpc, Scene(now, seen.gripper, start), end, found,
+            lambda *leg: mpc.plan(*leg, Memory(seed)))
         return targets_by(subgoals, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []

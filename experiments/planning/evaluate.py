@@ -59,12 +59,7 @@ def write_results(out):
 
 
 def make_jobs(args):
-    """
-    Return the Jobs of each task and method, by the seed of their first scene.
-
-    :raises ConfigError: for a method or predictor that cannot be used. The usual methods of
-        stacking are left out where there are no weights of them.
-    """
+    """Return the Jobs of tasks and methods by first seed; usual ones only where weights are."""
     planner = with_preset(args.preset, solver=args.solver)
     named, jobs = {'shipped': '{task}'}, {}
     for text in args.predictor:
@@ -90,13 +85,7 @@ def make_jobs(args):
 
 
 def find_weights(method, task, named):
-    """
-    Find the weights of a method that predicts.
-
-    :param named: dict from names to files, with {task} for the task.
-    :return: str, a file that is there.
-    :raises ConfigError: where there is none.
-    """
+    """Return the weights of a method that predicts, by names with {task}; ConfigError without."""
     name, warp = RUNS.get(method.base, method.base), '' if task in STACKING_TASKS else '-warp'
     usual = TRAINED.format(task=task, name=name, warp=warp)
     file = str(find_predictor(named.get(method.base, usual).replace('{task}', task)))

@@ -16,15 +16,10 @@ WHITE = (255, 255, 255)
 
 def write_film(job, scenes, path):
     """
-    Run three scenes again, and draw each as a row.
+    Run three scenes of a Job again, and draw each as a row.
 
     Of pushing: what was done, the subgoals, the goal. Of stacking: the start, the pictures that
     were brought about, with a cross for each object where it was read, what was done.
-
-    :param job: runs.Job.
-    :param scenes: its results by seed.
-    :param path: .png file.
-    :raises ConfigError: if a scene does not end as it did.
     """
     rows, order = [], sorted(scenes, key=lambda seed: (scenes[seed]['final_cm'], seed))
     for seed in (order[0], order[(len(order) - 1) // 2], order[-1]):

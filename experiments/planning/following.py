@@ -42,13 +42,7 @@ class Follower:
             self._camera.camera_matrix, (CAMERA_SIZE, CAMERA_SIZE), self._camera.camera_pose))
 
     def select(self, seen, seed):
-        """
-        Click on the objects.
-
-        :param seen: Observation of the start; seed: of the scene.
-        :return: the Observation with tracked pixels, and the states of the objects.
-        :raises TrackingError: when nothing is found where it was clicked.
-        """
+        """Click on the objects; return the Observation with tracked pixels, and the states."""
         view, self._rng = _view(self._camera.reset(seed)), np.random.default_rng([seed, 0])
         for _ in range(CLICKS):  # who is refused clicks again
             clicks = (seen.object_pixels + self._slips(seen) + 0.5) * self._scale - 0.5

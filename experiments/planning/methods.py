@@ -18,8 +18,9 @@ import re
 
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.plugins import names
-from tap_ros.planning.mpc_config import FIRST_SCENE, PLANNING_TASKS, with_samples
+from tap_ros.planning.mpc_config import PLANNING_TASKS
 
+FIRST_SCENE = 1_000_000  # seed of the scenes that are planned in, far from the recordings'
 STACKING_TASKS = ('stack3', 'stack2', 'pick_place')
 TASKS = (*PLANNING_TASKS, *STACKING_TASKS)
 FIRST_SCENES = {**dict.fromkeys(PLANNING_TASKS, FIRST_SCENE),
@@ -106,13 +107,7 @@ DEFAULTS = {field.name: field.default for field in fields(Method)}
 
 
 def parse_method(text):
-    """
-    Read a method.
-
-    :param text: base and options, for example 'fix', 'genmin:recursion2:half', 'true_model'.
-    :return: Method; fields that the base has no use for are at their defaults.
-    :raises ConfigError: for an unknown option or an impossible combination.
-    """
+    """Read a Method, for example 'fix', 'genmin:recursion2:half', 'true_model'; ConfigError."""
     base, *options = text.split(':')
     if base == 'true_model':
         base, options = 'direct', ['true_model', *options]
@@ -137,3 +132,11 @@ def parse_method(text):
         raise ConfigError(f'method {text!r}: samples are chosen by the learned model alone; leave '
                           'out one of the options')
     return method
+
+
+def with_samples(config, num_samples):
+    """Return a config with so many samples, and elites and proposals in proportion."""
+    share = num_samples / config.search.num_samples
+    search = replace(config.search, num_samples=num_samples,
+                     num_elites=max(2, round(share * config.search.num_elites)))
+    return replace(config, search=search, proposals=int(share * config.proposals))

@@ -43,12 +43,7 @@ class Move:
 
 
 class PictureReader:
-    """
-    Finds the objects of a scene in pictures of it.
-
-    :param simulator: Simulator, just reset.
-    :param seen: Observation of that moment.
-    """
+    """Finds the objects of a scene in pictures of it, from the moment after a reset."""
 
     def __init__(self, simulator, seen):
         away = seen.object_poses.copy()
@@ -73,14 +68,10 @@ class PictureReader:
 
     def read(self, picture, now):
         """
-        Find the objects.
+        Return where objects are (K, 2), NaN for those not seen; now: (K, 2) where they are.
 
         What a picture shows twice, where it is and elsewhere, is taken to be elsewhere:
         predictions often leave what they move at its old place, too.
-
-        :param picture: uint8 (H, W, 3).
-        :param now: (K, 2) (u, v) where their origins are.
-        :return: (K, 2) (u, v) of their origins, NaN for those that are not seen.
         """
         return np.array([self._find(k, mask, now[k])
                          for k, mask in enumerate(self._masks(picture))])
@@ -135,16 +126,11 @@ def _parts(mask):
 
 def read_moves(pixels, poses, camera):
     """
-    Say what has to be moved so that the objects are where a picture shows them.
+    Return the Moves that put objects where a picture shows them, the lowest in it first.
 
-    An object that is not seen stays. One that is shown above another one, at any height, is to be
-    put on that; else it is taken to lie on the table. That is wrong for one that is carried over
-    the table, where a picture cannot tell height from depth.
-
-    :param pixels: (K, 2) where the picture shows the objects, NaN where it does not.
-    :param poses: (K, 3 or more) m, where they are.
-    :param camera: Camera.
-    :return: list of Move, what is lowest in the picture first.
+    An object that is not seen (NaN) stays. One that is shown above another one, at any height, is
+    to be put on that; else it is taken to lie on the table. That is wrong for one that is carried
+    over the table, where a picture cannot tell height from depth.
     """
     gaps = np.linalg.norm(pixels - camera.project(poses[:, :3]), axis=1)
     moved = [k for k in np.argsort(-pixels[:, 1]) if gaps[k] >= STAYS]  # not NaN

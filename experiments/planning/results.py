@@ -23,11 +23,7 @@ def make_rows(results):
     Turn results of pushing into the rows of planning.json.
 
     A difference is this method minus another, over the scenes that both were run on, so that less
-    than 0 cm, or more than 0 of success, is better; see partners. Intervals are of 95%, by
-    bootstrap over scenes.
-
-    :param results: of runs.load_results.
-    :return: list of dicts.
+    than 0 cm, or more than 0 of success, is better; see partners.
     """
     rows, names, tables = [], {}, {}
     for (task, name), (_, scenes) in results.items():
@@ -68,14 +64,7 @@ def make_rows(results):
 
 
 def make_stack_rows(results):
-    """
-    Turn results of stacking into the rows of stacking.json.
-
-    Intervals are of 95%: Wilson's of shares, by bootstrap over scenes of means and differences.
-
-    :param results: of runs.load_results.
-    :return: list of dicts.
-    """
+    """Turn results of stacking into the rows of stacking.json; shares have Wilson's intervals."""
     rows = []
     tables = {key: pd.DataFrame.from_dict(scenes, 'index').sort_index()[
         [*SHARES, *MEANS]].astype(float) for key, (_, scenes) in results.items()}
@@ -104,12 +93,7 @@ def _row(task, name, metric, found, count, **more):
 
 
 def comparable(compares, settings, others):
-    """
-    Say whether two results differ in nothing but what is compared.
-
-    :param compares: of partners.
-    :param settings: of one result; others: of the other.
-    """
+    """Say whether the settings of two results differ in nothing but what is compared."""
     same = all(settings[key] == others[key] for key in SAME if key != compares)
     if compares not in ('direct, twice', 'search'):  # these are settings of the planner
         same &= settings['planner'] == others['planner']
@@ -121,15 +105,11 @@ def comparable(compares, settings, others):
 
 def partners(method, names):
     """
-    Say which methods one is compared with: those that differ in one part only.
+    Return [(what is compared, name)] of those that differ from a method in one part only.
 
-    :param method: Method.
-    :param names: of all methods that there are results of.
-    :return: list of (what is compared, name of the other): 'direct' and 'fix' with the same
-        planner (fix with the same switch, recursion and rounds, too, and trained likewise where
-        there are results of that), direct with twice the samples; for each option the method
-        without it, under the name of Method's field; for true_subgoal every predictor, as
-        'subgoal'.
+    'direct' and 'fix' with the same planner (fix with the same switch, recursion and rounds, too,
+    and trained likewise where there are results of that), direct with twice the samples; for each
+    option the method without it; for true_subgoal every predictor, as 'subgoal'.
     """
     if method.base == 'nothing':
         return []

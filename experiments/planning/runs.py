@@ -95,12 +95,7 @@ class Job:
 
 
 class ResultFile:
-    """
-    What one job found in the scenes so far.
-
-    :param folder: of all results; job: Job.
-    :raises ConfigError: if the file there is damaged, or was made with other settings.
-    """
+    """What one job found in the scenes so far; ConfigError if it was made with other settings."""
 
     def __init__(self, folder, job):
         self.path = Path(folder, job.file_name + '.json')
@@ -123,12 +118,10 @@ class ResultFile:
 
 def read_results(path):
     """
-    Read a result file.
+    Return the settings of a result file, and its scenes by seed; ConfigError if damaged.
 
-    :return: its settings, and its scenes as a dict by seed. Settings of the planner that no longer
-        exist are left out: each had but the one value that now is a constant. Where no look is
-        told, there was but one.
-    :raises ConfigError: if it is damaged.
+    Settings of the planner that no longer exist are left out: each had but the one value that now
+    is a constant. Where no look is told, there was but one.
     """
     try:
         stored = json.loads(Path(path).read_text())
@@ -151,12 +144,7 @@ def known(stored, names):
 
 
 def load_results(folder):
-    """
-    Read all result files of a folder.
-
-    :return: dict (task, method name) -> (settings, scenes by seed).
-    :raises ConfigError: if one is damaged.
-    """
+    """Read all result files of a folder: (task, method name) -> (settings, scenes by seed)."""
     found = {}
     for path in sorted(Path(folder).glob('*.json')):
         settings, scenes = read_results(path)
@@ -166,15 +154,7 @@ def load_results(folder):
 
 
 def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True):
-    """
-    Run all jobs on all scenes, and go on where an interrupted evaluation stopped.
-
-    :param jobs: list of Job; seeds: of the scenes of each, in turn.
-    :param folder: of the result files.
-    :param engine: Engine; each scene is planned in one thread.
-    :return: list of ResultFile, one for each job.
-    :raises ConfigError: for result files that are damaged or made with other settings.
-    """
+    """Run all Jobs on the scenes of seeds that are not done; return a ResultFile for each."""
     files = [ResultFile(folder, job) for job in jobs]
     # scene by scene, so that what was run so far can be compared
     todo = [(i, seed) for seed in seeds for i, file in enumerate(files)
@@ -198,7 +178,6 @@ def run_scene(job, seed):
         switches, blocked (descents that met something at one place, at most), plan_ms (median)
         and, without true object pixels, tracking_error_px and why nothing was planned (refused),
         or no more (aborted), if so; of stacking success, first_right, moves and seconds.
-    :raises PlanningError: if it cannot be planned; the message names task, method and scene.
     """
     begin = time.perf_counter()
     try:

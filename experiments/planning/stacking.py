@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from experiments.planning.episode import shown_mask
 from experiments.planning.reading import Move, PictureReader, read_moves
 import numpy as np
-from sim_bridge.tasks.stack import on_table, PickAndPlace
+from sim_bridge.tasks.stack import on_table, pick_and_place
 from sim_bridge.tasks.tasks import run_episode as run_expert
 from tap_ros.base.contract import LIFTED, SUCCESS_DISTANCE
 from tap_ros.base.errors import ConfigError
@@ -51,16 +51,7 @@ class StackedEpisode:
 
 
 def stack(simulator, method, seed, predictor=None):
-    """
-    Bring the pictures of a method about in one scene.
-
-    :param simulator: Simulator of a task in which something is put somewhere; reset here.
-    :param method: methods.Method.
-    :param seed: of the scene, of the order of moves where the method has none, and of the arm.
-    :param predictor: SubgoalPredictor, for methods that predict.
-    :return: StackedEpisode.
-    :raises ConfigError: when the predictor is missing.
-    """
+    """Bring the pictures of a method about in one scene; return the StackedEpisode."""
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     shown = _expert_subgoals(simulator, seed) if method.base == 'true_subgoals' else []
@@ -72,7 +63,7 @@ def stack(simulator, method, seed, predictor=None):
     # The same order for all methods that know none, so that they are compared scene by scene.
     stream = simulator.task.stream
     order = np.random.default_rng([seed, stream, 2]).permutation(simulator.task.num_objects)
-    mover = PickAndPlace(simulator, np.random.default_rng([seed, stream, 3]))
+    rng = np.random.default_rng([seed, stream, 3])
     stages, frames = [], [start.image]
     for picture in pictures:
         poses = simulator.object_poses()[:, :3]
@@ -86,7 +77,7 @@ def stack(simulator, method, seed, predictor=None):
         elif method.base != 'lowest_first':
             moves.sort(key=lambda move: order.tolist().index(move.object))
         for move in moves:
-            frames += _make(simulator, mover, move)
+            frames += _make(simulator, rng, move)
         stages.append(Stage(picture, pixels, moves))
     distances = simulator.distances()
     success = simulator.outcome() == 'success' and bool((distances < SUCCESS_DISTANCE).all())
@@ -98,10 +89,11 @@ def stack(simulator, method, seed, predictor=None):
     return run
 
 
-def _make(simulator, mover, move):
+def _make(simulator, rng, move):
     """Make a move, rise and wait until all is at rest; return the pictures meanwhile."""
     frames = []
-    for plan in mover.move(move.object, lambda: what_is_below(simulator.object_poses(), move)):
+    for plan in pick_and_place(simulator, rng, move.object,
+                               lambda poses: what_is_below(poses, move)):
         frames += [simulator.step(action).image for action in plan]
     rise = [[0, 0, max(LIFTED - simulator.target[2], 0), 1]]
     return frames + [simulator.step(action).image
@@ -109,13 +101,7 @@ def _make(simulator, mover, move):
 
 
 def what_is_below(poses, move):
-    """
-    Say on what an object comes to stand.
-
-    :param poses: (K, 3 or more) m, where the objects are.
-    :param move: Move.
-    :return: (3,) m, the origin of the highest other object at the place, see also on_table.
-    """
+    """Return (3,) m, the origin of the highest other object at a place, see also on_table."""
     place = np.array(move.place)
     others = np.delete(poses[:, :3], move.object, axis=0)
     under = others[np.linalg.norm(others[:, :2] - place, axis=1) < OVER]

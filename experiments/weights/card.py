@@ -13,7 +13,8 @@ from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.samples import SAMPLES, score_samples
 from tap_ros.evaluation.shown import SHOWN
-from tap_ros.evaluation.strips import write_strips
+from tap_ros.evaluation.strips import draw_strips
+from tap_ros.images.drawing import png_bytes
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights.weights import load_weights, save_weights
@@ -33,12 +34,8 @@ def ship(name, task, run, fresh, out, commands):
     """
     Write a run's weights as float16, with a card and a picture.
 
-    :param name: of the recipe; task: of its scenes.
-    :param run: folder of the training.
     :param fresh: folder of the recording of scenes that it never saw.
-    :param out: folder to write into.
     :param commands: lines: those that collect, that of the fresh scenes, that of the training.
-    :return: Path of the card.
     """
     run = Path(run)
     config, state, about = load_weights(run / 'predictor.safetensors', 'predictor')
@@ -66,11 +63,11 @@ def ship(name, task, run, fresh, out, commands):
         drawn = score_samples(network, store, episodes)
         placed = drawn.spread_px[np.isfinite(drawn.spread_px)]
         samples = {'count': SAMPLES, 'placed': f'{placed.mean():.1f}' if len(placed) else '',
-                   'near': f'{np.nanmean(drawn.spread_near):.4f}',
+                   'spread': f'{drawn.spread.mean():.4f}',
                    'best': '{:.4f} ({:.4f} to {:.4f})'.format(*mean_interval(drawn.min_l1))}
     good = found(first)
     shown = [*np.flatnonzero(good)[:PICTURED], *np.flatnonzero(~good)[:PICTURED]]
-    write_strips(file.with_suffix('.png'), network, store, shown, 'last')
+    write_atomically(file.with_suffix('.png'), png_bytes(draw_strips(network, store, shown)))
     card = file.with_suffix('.md')
     *collect, again, train = commands
     write_atomically(card, render(
@@ -85,25 +82,14 @@ def ship(name, task, run, fresh, out, commands):
 
 
 def found(scores):
-    """
-    Say of each episode whether its prediction is what it should be.
-
-    :param scores: EpisodeScores of predictions.
-    :return: bool (N,): a bottleneck within THRESHOLD where objects are pushed; else whether both
-        hand and objects are shown.
-    """
+    """Say of each episode whether its bottleneck is found, or hand and object are shown."""
     if np.isfinite(scores.bottleneck).any():
         return scores.bottleneck <= THRESHOLD
     return np.minimum(scores.hand, scores.objects) >= SHOWN
 
 
 def tabulate(scores):
-    """
-    Make the card's table.
-
-    :param scores: dict from a description of the goal picture to {method: EpisodeScores}.
-    :return: DataFrame, a line for each goal picture and method; what is not known has no column.
-    """
+    """Make the card's table of {goal picture: {method: EpisodeScores}}, without empty columns."""
     lines = {(goal, method): score.intervals()
              for goal, methods in scores.items() for method, score in methods.items()}
     table = pd.DataFrame(list(lines), columns=['goal picture', 'method'])

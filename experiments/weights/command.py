@@ -50,13 +50,7 @@ class Options:
 
 
 def collections(name, bags):
-    """
-    Return what a recipe's weights are trained on, and last the fresh scenes for their scores.
-
-    :param name: of the recipe.
-    :param bags: folder of recordings.
-    :return: {folder: options of `collect`}.
-    """
+    """Return {folder: options of `collect`} of a recipe, the fresh scenes to score in last."""
     task, recordings = SHIPPED[name]
     found = {**recordings, f'fresh_{task}': {'episodes': FRESH_EPISODES, 'seed': FRESH_SEED}}
     return {str(Path(bags, folder)): {'task': task, **options}
@@ -64,13 +58,7 @@ def collections(name, bags):
 
 
 def commands(name, bags='bags', runs='runs/weights'):
-    """
-    Return the command line of each step, in order.
-
-    :param name: of the recipe.
-    :param bags: folder of recordings; runs: of trainings.
-    :return: list: one or several that collect, one of fresh scenes, and that of the training.
-    """
+    """Return the command line of each step: those that collect, fresh scenes, the training."""
     found = collections(name, bags)
     lines = [['collect', *(word for option, value in options.items()
                            for word in (f'--{option.replace("_", "-")}', str(value))),
@@ -81,11 +69,7 @@ def commands(name, bags='bags', runs='runs/weights'):
 
 
 def run(args):
-    """
-    Collect, train and write the card of each, one after the other.
-
-    :param args: Options.
-    """
+    """Collect, train and write the card of each, one after the other."""
     for name in args.only or SHIPPED:
         print('\n'.join(commands(name, args.bags, args.runs)), flush=True)
         if args.list:

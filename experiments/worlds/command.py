@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 import cv2
 from experiments.pages import render
+from experiments.worlds.ogbench import OGBench
 from experiments.worlds.trained import (
     held_out_of,
     mark,
@@ -36,7 +37,7 @@ from tap_ros.recording.reading import Reading
 from tap_ros.training.marks import chance
 from tap_ros.training.predictor_config import RECIPES
 
-Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'fix to marks']
+Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
          'metaworld/window-open-v3', 'metaworld/drawer-open-v3',
          'metaworld/button-press-topdown-v3', 'ogbench/button', 'ogbench/cube', 'ogbench/drawer',
@@ -96,22 +97,23 @@ def score_tasks(tasks, methods, args, prefix=''):
     Collect demonstrations, score keyframes of them and trainings on them.
 
     :param tasks: by their names seeds of their first demonstrations.
-    :param methods: that are trained; args: Options.
     :param prefix: of the tasks' names in the results, and of their folders.
     :return: list of rows of both kinds, and of each task a strip.
     """
     rows, folders, strips = [], {}, []
-    for name, first in tasks.items():
+    for name, first_seed in tasks.items():
         world, _, task = name.partition('/')
         folders[prefix + name] = folder = Path(args.bags, prefix, world, task)
         if not args.results_only:
-            for bag, episodes, seed in ((folder, args.episodes, first),
-                                        (held_out_of(folder), HELD_OUT, first + 10 ** 6)):
+            for bag, episodes, seed in ((folder, args.episodes, first_seed),
+                                        (held_out_of(folder), HELD_OUT, first_seed + 10 ** 6)):
                 collect(bag, CollectConfig(
                     world=world, task=task, episodes=episodes, seed=seed,
-                    image_size=args.image_size, episodes_per_file=10), args.engine)
+                    image_size=args.image_size, episodes_per_file=10), args.engine,
+                    make=OGBench if world == 'ogbench' else None)
         training, held_out = map(read, (folder, held_out_of(folder)))
-        strips.append(strip(held_out[0]))
+        one, (first, last) = held_out[0].frames, held_out[0].window
+        strips.append([one[i] for i in (0, first, (first + last) // 2, last, -1)])
         for seed in range(args.seeds):
             mark(folder, training, seed)
         # Of keyframes all are held out that no seed marks.
@@ -131,12 +133,7 @@ class Demonstration(NamedTuple):
 
 
 def read(folder):
-    """
-    Read a bag and its true bottlenecks.
-
-    :return: list of Demonstrations.
-    :raises ConfigError: if they are not known.
-    """
+    """Read a bag as Demonstrations; ConfigError if its bottlenecks are not known."""
     path = Path(folder, BOTTLENECKS_FILE)
     if not path.exists():
         raise ConfigError(f'{path}: is not there; collect it by a world that knows bottlenecks')
@@ -145,22 +142,15 @@ def read(folder):
     return [Demonstration(store[i].frames, truth[i][0], i) for i in sorted(truth)]
 
 
-def strip(one):
-    """Return the start, the bottleneck's first, middle and last frame, and the goal."""
-    first, last = one.window
-    return [one.frames[i] for i in (0, first, (first + last) // 2, last, -1)]
-
-
 def score(marked, held_out):
     """
     Score keyframes.
 
     :param marked: of each seed, the Demonstrations that are marked, and the frames.
-    :param held_out: Demonstrations that are scored.
     :return: list of dicts: method, hit and near (at most a frame beside the bottleneck), each
         with value, low and high, n, and the mean frames of bottlenecks and demonstrations.
     """
-    from tap_ros.evaluation import keyframes
+    from experiments.worlds import keyframes
     methods = {
         'middle': [keyframes.middle], 'slowest': [keyframes.slowest], 'UVD-like': [keyframes.uvd],
         f'{MARKED} marks': [keyframes.from_marks([one.frames for one in demonstrations], frames)
@@ -189,20 +179,18 @@ def _interval(hits):
 
 def average(rows):
     """Average over the seeds of each task and method, with intervals over the episodes."""
-    found = []
-    for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
-        same = [row for row in rows if (row['task'], row['method']) == (task, method)]
-        line = {'task': task, 'method': method, 'n': len(same[0]['hit']), 'seeds': len(same)}
-        for key in ('hit', 'near'):
-            line[key] = Interval(*map(float, _interval([row[key] for row in same])))._asdict()
-        found.append(line)
-    return found
+    found = {}
+    for row in rows:
+        found.setdefault((row['task'], row['method']), []).append(row)
+    return [{'task': task, 'method': method, 'n': len(same[0]['hit']), 'seeds': len(same), **{
+        key: Interval(*map(float, _interval([row[key] for row in same])))._asdict()
+        for key in ('hit', 'near')}} for (task, method), same in found.items()]
 
 
 def page(rows):
     """Write the page of the results, a line for each task."""
-    lengths, tables, seeds, found = ({}, *(
-        {kind: {} for kind in ('keyframes', 'trained', 'aside')} for _ in range(3)))
+    lengths, (tables, seeds, found) = {}, (
+        {kind: {} for kind in ('keyframes', 'trained', 'aside')} for _ in range(3))
     for row in rows:
         task, method, hit, near = (row[name] for name in ('task', 'method', 'hit', 'near'))
         kind = ('aside' if task.startswith('aside/') else

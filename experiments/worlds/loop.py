@@ -15,12 +15,12 @@ from pathlib import Path
 import cv2
 from experiments.pages import render, share
 from experiments.planning.episode import run_episode
-from experiments.planning.methods import Method
+from experiments.planning.methods import FIRST_SCENE, Method
+from experiments.worlds.pushes import push_to_goal, WORLDS
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
-from sim_bridge.gym_pushes import push_to_goal
-from sim_bridge.world_protocol import make_world
+from sim_bridge.metaworld import MetaWorld
 from tap_ros.apps.train import train
 from tap_ros.base.contract import ACTION_LIMIT, step_budget
 from tap_ros.base.engines import Engine
@@ -29,7 +29,7 @@ from tap_ros.base.files import write_atomically, write_rows
 from tap_ros.base.options import Flag, Folder
 from tap_ros.evaluation.intervals import mean_interval, share_interval
 from tap_ros.images.drawing import enlarge, grid
-from tap_ros.planning.mpc_config import FIRST_SCENE, VisualMPCConfig
+from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
@@ -87,25 +87,19 @@ class Options:
 
 def run(args):
     """Collect, train, run scene by scene all methods, write what came of it."""
-    runs = Path(args.runs)
     if not args.results_only:
-        weights = make_weights(args)
-        run_scenes(args, weights)
-    write_results(runs, Path(args.out), args)
+        run_scenes(args, make_weights(args))
+    write_results(Path(args.runs), Path(args.out), args)
 
 
 def make_weights(args):
-    """
-    Make bags and trainings, or go on with them.
-
-    :return: dict: 'forward', and of each task a predictor; paths.
-    """
+    """Make bags and trainings; return paths by task, and the forward model's."""
     bags = {task: Path(args.bags, task) for task in args.tasks}
     for task, folder in bags.items():
         for pushes, seed in BAGS.items():
             collect(folder / pushes, CollectConfig(
-                world=WORLD, task=task, episodes=args.episodes, seed=seed, pushes=pushes,
-                image_size=IMAGE_SIZE, episodes_per_file=10), args.engine)
+                world=f'{WORLD} {pushes}', task=task, episodes=args.episodes, seed=seed,
+                image_size=IMAGE_SIZE, episodes_per_file=10), args.engine, make=WORLDS[pushes])
     weights = {'forward': str(train(
         [folder / name for folder in bags.values() for name in BAGS],
         Path(args.runs, 'forward'), 'forward', steps=args.steps, **FORWARD))}
@@ -117,12 +111,7 @@ def make_weights(args):
 
 
 def mark(folder):
-    """
-    Mark a dozen demonstrations where the hand is at the object, each off by at most a frame.
-
-    :param folder: of the bag.
-    :return: path of the file.
-    """
+    """Mark a dozen demonstrations where the hand is at the object, off by at most a frame."""
     store, rng, marks = open_recordings([folder]), np.random.default_rng(0), {}
     for i in range(len(store)):
         episode = store[i]
@@ -141,56 +130,47 @@ def run_scenes(args, weights):
     """Run the methods in the scenes that have a goal; what was run is not run again."""
     with tqdm(total=args.scenes * len(args.tasks), unit='scene') as bar:
         for task in args.tasks:
-            done, seed = read_rows(args.runs, task), FIRST_SCENE
-            count = 0
+            (path, done), seed, count = read_rows(args.runs, task), FIRST_SCENE, 0
             while count < args.scenes:
                 rows = done.setdefault(seed, {})
                 for method in args.methods:
                     if method not in rows:
                         rows[method] = run_scene(
                             task, method, seed, weights['forward'], weights[task], args.runs)
-                        write_atomically(rows_of(args.runs, task), json.dumps(done) + '\n')
+                        write_atomically(path, json.dumps(done) + '\n')
                 solved = all(rows.values())
                 count, seed = count + solved, seed + 1
                 bar.update(solved)
 
 
-def rows_of(runs, task):
-    """Return the file of what came of the scenes of a task."""
-    return Path(runs, task, 'scenes.json')
-
-
 def read_rows(runs, task):
-    """Return rows by seed and method; None where the scene has no goal."""
-    path = rows_of(runs, task)
+    """Return the file of a task's scenes, and its rows by seed and method; None: no goal."""
+    path = Path(runs, task, 'scenes.json')
     found = json.loads(path.read_text()) if path.exists() else {}
-    return {int(seed): rows for seed, rows in found.items()}
+    return path, {int(seed): rows for seed, rows in found.items()}
 
 
-class Judged:
-    """A World that notes what the environment says after every step."""
-
-    def __init__(self, world):
-        self.world, self.said = world, []
-
-    def __getattr__(self, name):
-        return getattr(self.world, name)
+class Judged(MetaWorld):
+    """Meta-World, and what it says after every step."""
 
     def reset(self, seed):
         """Begin a scene."""
         self.said = []
-        return self.world.reset(seed)
+        return super().reset(seed)
 
     def step(self, action):
         """Act, and note."""
-        seen = self.world.step(action)
-        self.said.append(self.world.succeeds())
+        seen = super().step(action)
+        self.said.append(self.succeeds())
         return seen
+
+
+_world = lru_cache(Judged)
 
 
 def run_scene(task, method, seed, forward, predictor, runs):
     """Run a method in a scene; return what came of it, None if the scene has no goal."""
-    world = _world(task)
+    world = _world(task, IMAGE_SIZE)
     try:
         pictures = act(world, method, seed, _planner(forward, PLANNER), predictor)
     except SceneError:
@@ -206,11 +186,7 @@ def run_scene(task, method, seed, forward, predictor, runs):
 
 
 def act(world, method, seed, mpc, predictor):
-    """
-    Act in one scene by one method, for as many control periods as a goal may take.
-
-    :return: list: pictures of start, subgoals, end and goal; last the distance, cm, at the start.
-    """
+    """Act as long as a goal may take; return pictures of start, subgoals, end and goal, cm."""
     budget = step_budget(1)
     if method in ('direct', 'subgoal'):
         predict = _predictor(predictor) if method == 'subgoal' else None
@@ -230,36 +206,30 @@ def act(world, method, seed, mpc, predictor):
             round(100 * float(distance), 2)]
 
 
-@lru_cache
-def _world(task):
-    return Judged(make_world(WORLD, task, IMAGE_SIZE))
-
-
 def write_results(runs, out, args):
     """Write all rows, the table and the strips."""
-    rows = [row for task in args.tasks for rows in read_rows(runs, task).values()
+    rows = [row for task in args.tasks for rows in read_rows(runs, task)[1].values()
             for row in rows.values() if row]
-    table = pd.DataFrame(summarise(rows))
     write_rows(out / 'worlds_loop.json', rows)
-    strips = [path for task in args.tasks for path in sorted(Path(runs, task).glob('strip_*.png'))]
+    strips = [[cv2.imread(str(path))] for task in args.tasks
+              for path in sorted(Path(runs, task).glob('strip_*.png'))]
     if strips:
-        cv2.imwrite(str(out / 'worlds_loop.png'), grid([[cv2.imread(str(path))]
-                                                        for path in strips]))
+        cv2.imwrite(str(out / 'worlds_loop.png'), grid(strips))
     write_atomically(out / 'worlds_loop.md', render(
-        'worlds/templates/worlds_loop.md.j2', table=table, marked=MARKED, **asdict(args)))
+        'worlds/templates/worlds_loop.md.j2', table=pd.DataFrame(summarise(rows)), marked=MARKED,
+        **asdict(args)))
     print(out / 'worlds_loop.md')
 
 
 def summarise(rows):
     """Return a line for each task and method: shares and distances with 95% intervals."""
     found = []
-    for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
-        same = [row for row in rows if (row['task'], row['method']) == (task, method)]
+    for (task, method), same in pd.DataFrame(rows).groupby(['task', 'method'], sort=False):
         line = {'task': task, 'method': method, 'scenes': len(same)}
         for name in ('ends', 'ever'):
-            line[name] = share(share_interval([row[name] for row in same]))
+            line[name] = share(share_interval(same[name].tolist()))
         for name in ('start_cm', 'final_cm'):
-            value, low, high = mean_interval([row[name] for row in same])
+            value, low, high = mean_interval(same[name].tolist())
             line[name] = f'{value:.1f} ({low:.1f} to {high:.1f})'
-        found.append({**line, 'steps': f'{np.mean([row["steps"] for row in same]):.0f}'})
+        found.append({**line, 'steps': f'{np.mean(same["steps"]):.0f}'})
     return found

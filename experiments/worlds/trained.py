@@ -20,7 +20,6 @@ METHODS = {
     'progress': {'selection': 'progress', 'progress_margin': 0.5},
     'still': {'selection': 'still'},
     'marks': {'selection': 'marks'},
-    'fix to marks': {'loss': 'fix', 'selection': 'marks'},
 }
 SETTINGS = {'recipe': 'foreign', 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
 
@@ -34,9 +33,7 @@ def place_marks(folder, demonstrations, seed):
     """
     Mark demonstrations as a person would: the middle of the bottleneck, off by up to 1.5 frames.
 
-    :param folder: of the bag; its name and the seed say by how much each is off.
-    :param demonstrations: list of command.Demonstrations, of which each seed has MARKED others.
-    :return: those that are marked, and the frame of each.
+    :return: the MARKED ones that a seed marks, and the frame of each.
     """
     rng = np.random.default_rng([seed, *folder.name.encode()])
     marked = demonstrations[seed * MARKED:][:MARKED]
@@ -58,14 +55,7 @@ def mark(folder, demonstrations, seed):
 
 
 def train_all(folders, methods, seeds, out, engine):
-    """
-    Train and score all methods on all bags; what is scored already is not done again.
-
-    :param folders: by the names of tasks.
-    :param seeds: how many trainings of each method.
-    :param out: folder of the runs.
-    :return: list of dicts: task, method, seed, and hit, near: lists of 0 and 1, an episode each.
-    """
+    """Train and score all that is not done; return rows with hit, near: 0 or 1 an episode."""
     work = [Work(f'{task}/{method}/{seed}', train_and_score, (
                 str(folder), method, seed, str(Path(out, task, f'{method}_{seed}'))))
             for seed in range(seeds) for task, folder in folders.items() for method in methods]
@@ -82,7 +72,7 @@ def train_and_score(folder, method, seed, out):
     """Train a predictor; return which held-out episodes it hits, exactly and within a frame."""
     from sim_bridge.collect import BOTTLENECKS_FILE
     from tap_ros.apps.train import train
-    from tap_ros.evaluation.keyframes import is_hit
+    from tap_ros.evaluation.hits import is_hit
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.prediction.predictor import load_network
     from tap_ros.recording.bags import reading_like

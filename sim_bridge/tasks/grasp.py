@@ -20,25 +20,17 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sim_bridge.tasks.tasks import (
-    carry_out,
-    Demonstration,
-    EpisodeRun,
-    moves,
-    straight,
-    Task,
-    TaskScene,
-)
+from sim_bridge.tasks.motions import carry_out, direction, EpisodeRun, moves, straight
+from sim_bridge.tasks.tasks import DemonstrationOptions, Task, TaskScene
 from sim_bridge.world.looks import GRIP_SPREAD
 from sim_bridge.world.scene import (
-    box_shape,
     FINGER_GAP,
     FINGER_TRAVEL,
     HALF_HEIGHT,
     ObjectShape,
-    SHAPES,
+    random_shape,
 )
-from sim_bridge.world.table import GRIPPER_HEIGHT, OBJECT_QPOS_START, ramp_controls, Table
+from sim_bridge.world.table import GRIPPER_HEIGHT, objects_in, ramp_controls, Table, upright
 from sim_bridge.world_protocol import Observation
 from tap_ros.base.contract import (
     CLEAR,
@@ -78,50 +70,51 @@ class GraspTask(Task):
     kind: ClassVar[str] = 'grasp'
     gripping: ClassVar[bool] = True
     photographed: ClassVar[bool] = False
-    lifts: ClassVar[bool] = True  # the object is to be in the fingers at the end
+    lifts: ClassVar[bool] = True  # the object is to be in the fingers at the end; else let go
 
     def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
         """Draw one object that can be held; its goal is lifted, or elsewhere."""
-        shape = graspable_shape(rng)
+        shape = random_shape(rng, thin=True)
         yaw = graspable_yaw(shape, rng)
-        start = spread * rng.uniform(-GRASP_RANGE, GRASP_RANGE, 2)
-        goal = self._draw_goal(rng, start, spread)
+        start = goal = spread * rng.uniform(-GRASP_RANGE, GRASP_RANGE, 2)
+        nearest, farthest = np.multiply(PLACE_DISTANCE, spread)
+        while not (self.lifts or nearest <= np.linalg.norm(goal - start) <= farthest):
+            goal = spread * rng.uniform(-PLACE_RANGE, PLACE_RANGE, 2)
         gripper = np.full(2, np.inf)
         while (np.abs(gripper) > spread * GRASP_REACH_RANGE).any():
             angle = rng.uniform(0, 2 * np.pi)
-            reach = spread * rng.uniform(*self.reach)
-            gripper = start + reach * np.array([np.cos(angle), np.sin(angle)])
+            gripper = start + spread * rng.uniform(*self.reach) * direction(angle)
         return TaskScene((shape,), np.array([[*start, yaw]]),
                          np.array([[*goal, grasp_place(shape, yaw)[1]]]),
                          np.append(gripper, rng.uniform(0, GRIPPER_HEIGHT)), (0,))
 
-    def _draw_goal(self, rng: np.random.Generator, start: np.ndarray,
-                   spread: float) -> np.ndarray:
-        return start
-
     @property
     def goal_heights(self) -> float:
-        """Return how high the object is lifted."""
-        return LIFT_HEIGHT
+        """Return how high the object is lifted, or 0: it stands on the table."""
+        return LIFT_HEIGHT if self.lifts else 0.0
 
     def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
-        """Return where the gripper holds the lifted object, and its opening."""
+        """Return where the gripper holds the lifted object, or is above what it put down."""
         place, _, half_gap = grasp_place(scene.shapes[0], scene.start_poses[0, 2])
-        return np.array([
-            *scene.goal_poses[0, :2] + place, LIFT_HEIGHT + GRASP_HEIGHT,
-            (half_gap - FINGER_GAP) / FINGER_TRAVEL])
+        height, opening = LEAVE_HEIGHT, 1
+        if self.lifts:
+            height = LIFT_HEIGHT + GRASP_HEIGHT
+            opening = (half_gap - FINGER_GAP) / FINGER_TRAVEL
+        return np.array([*scene.goal_poses[0, :2] + place, height, opening])
 
     def succeeds(self, table: Table) -> bool:
-        """Return whether the fingers hold the object SUCCESS_DISTANCE above the table."""
+        """Return whether the fingers hold it SUCCESS_DISTANCE high, or it is so near its goal."""
+        if not self.lifts:
+            return super().succeeds(table)
         high = table.object_poses()[:, 2] - HALF_HEIGHT > SUCCESS_DISTANCE
         return bool(high.all() and table.touching())
 
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
-                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+                    rng: np.random.Generator, how: DemonstrationOptions) -> EpisodeRun:
         """Act for exactly so many frames."""
         expert = GraspExpert(table, rng, lifts=self.lifts)
         num_frames = how.num_frames or self.num_frames
-        return carry_out(table, self.succeeds, first, _plans(expert, num_frames), num_frames)
+        return carry_out(table, self.succeeds, first, expert.plans(num_frames), num_frames)
 
 
 @dataclass(frozen=True)
@@ -131,48 +124,10 @@ class PickPlaceTask(GraspTask):
     kind: ClassVar[str] = 'pick_place'
     lifts: ClassVar[bool] = False
 
-    def _draw_goal(self, rng: np.random.Generator, start: np.ndarray,
-                   spread: float) -> np.ndarray:
-        nearest, farthest = PLACE_DISTANCE[0] * spread, PLACE_DISTANCE[1] * spread
-        goal = start
-        while not nearest <= np.linalg.norm(goal - start) <= farthest:
-            goal = spread * rng.uniform(-PLACE_RANGE, PLACE_RANGE, 2)
-        return goal
-
-    @property
-    def goal_heights(self) -> float:
-        """Return 0: the object stands on the table."""
-        return 0.0
-
-    def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
-        """Return where the open gripper is above the object that it has just put down."""
-        place, _, _ = grasp_place(scene.shapes[0], scene.start_poses[0, 2])
-        return np.array([*scene.goal_poses[0, :2] + place, LEAVE_HEIGHT, 1])
-
-    def succeeds(self, table: Table) -> bool:
-        """Return whether the object is within SUCCESS_DISTANCE of its goal."""
-        return Task.succeeds(self, table)
-
 
 GRASP = GraspTask('grasp', num_objects=1, num_frames=15, stream=4, reach=(0.13, 0.32))
 PICK_PLACE = PickPlaceTask(
     'pick_place', num_objects=1, num_frames=20, stream=5, reach=(0.27, 0.33))
-
-
-def graspable_shape(rng: np.random.Generator) -> ObjectShape:
-    """
-    Draw a thin shape and its colours.
-
-    :param rng: numpy Generator.
-    :return: ObjectShape with its centre of area at the origin.
-    """
-    kind = SHAPES[rng.choice(len(SHAPES), p=(0.35, 0.35, 0.15, 0.15))]
-    colours = tuple(tuple(rng.uniform(0.3, 1.0, 3)) for _ in range(2))
-    if kind == 'disc':
-        size = (rng.uniform(0.02, 0.028), HALF_HEIGHT)
-        return ObjectShape(kind, (size,), ((0, 0),), colours[:1])
-    thickness, length = rng.uniform(0.014, 0.018), rng.uniform(0.06, 0.09)
-    return box_shape(kind, thickness, length, rng.uniform(0.03, 0.05), colours)
 
 
 def graspable_yaw(shape: ObjectShape, rng: np.random.Generator) -> float:
@@ -195,25 +150,23 @@ def grasp_place(shape: ObjectShape, yaw: float) -> tuple[np.ndarray, float, floa
     """
     if shape.kind == 'disc':
         return np.zeros(2), yaw, shape.half_sizes[0][0]
-    angles = [(yaw - (np.pi / 2 if size[0] > size[1] else 0)) for size in shape.half_sizes]
-    angles = np.array([(angle + np.pi / 2) % np.pi - np.pi / 2 for angle in angles])
+    sizes = np.array(shape.half_sizes)[:, :2]
+    angles = yaw - np.where(sizes[:, 0] > sizes[:, 1], np.pi / 2, 0)  # of the parts, from y
+    angles = (angles + np.pi / 2) % np.pi - np.pi / 2
     held = int(np.abs(angles).argmin())
     yaw = yaw - angles[held]
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    centres = np.array(shape.centres) @ turn.T
-    sizes = np.abs(np.array(shape.half_sizes)[:, :2] @ turn.T)
+    centres, sizes = np.array(shape.centres) @ turn.T, np.abs(sizes @ turn.T)
     half_gap, length = sizes[held]
     places = centres[held, 1] + np.linspace(-length, length, 41)
     free = np.ones(len(places), bool)
-    for k in range(len(centres)):
-        if k != held:
-            low, high = centres[k] - sizes[k], centres[k] + sizes[k]
-            for sign in (-1, 1):
-                edges = centres[held, 0] + sign * np.array([half_gap, half_gap + FINGER_DEPTH])
-                beside = edges.max() > low[0] + 1e-6 and edges.min() < high[0] - 1e-6
-                overlap = (places + FINGER_HALF_WIDTH > low[1]) & (
-                    places - FINGER_HALF_WIDTH < high[1])
-                free &= ~(beside & overlap)
+    for k in {*range(len(centres))} - {held}:
+        low, high = centres[k] - sizes[k], centres[k] + sizes[k]
+        for sign in (-1, 1):
+            edges = centres[held, 0] + sign * np.array([half_gap, half_gap + FINGER_DEPTH])
+            if edges.max() > low[0] + 1e-6 and edges.min() < high[0] - 1e-6:
+                free &= (places + FINGER_HALF_WIDTH <= low[1]) | (
+                    places - FINGER_HALF_WIDTH >= high[1])
     places = places[free] if free.any() else places
     y = places[np.abs(places).argmin()]  # nearest to the centre of mass
     return np.array([centres[held, 0], y]), yaw, half_gap
@@ -261,13 +214,17 @@ class GraspExpert:
         # A grasp ends with the lift: it may be slow.
         self._lift_steps = int(rng.integers(*((2, 5) if lifts else (1, 3))))
 
-    def pick(self, steps_left: int) -> np.ndarray:
-        """
-        Plan to go to the object, grasp and lift it.
+    def plans(self, num_frames: int) -> Iterator[np.ndarray]:
+        """Yield the actions (n, 4) of an episode; each waits until those before are done."""
+        steps_left = num_frames - 1
+        for plan in (self._pick, self._place)[:1 if self.lifts else 2]:
+            actions = plan(steps_left)
+            yield actions
+            steps_left -= len(actions)
+        yield np.tile([0, 0, 0, self.table.target[3]], (max(steps_left, 0), 1))  # hold still
 
-        :param steps_left: control periods until the episode ends.
-        :return: (n, 4) actions.
-        """
+    def _pick(self, steps_left: int) -> np.ndarray:
+        """Plan to go to the object, grasp and lift it; so many control periods are left."""
         here = self.table.target
         steps_left -= self._reserve(steps_left)
         place = self._search()
@@ -282,12 +239,9 @@ class GraspExpert:
         if self.lifts:
             # Up to the last frame: idle frames beside the goal picture would make copying perfect.
             lift_steps = max(steps_left - (fixed - lift_steps) - travel - idle, lift_steps)
-        path = [here[:3]]
-        if rise:
-            path.append(np.append(here[:2], self.hover))
-        path += straight(path[-1], np.append(place, self.hover), travel)
-        if far:
-            path[-travel:] = [np.append(point[:2], self.hover) for point in path[-travel:]]
+        path = [here[:3], *[np.append(here[:2], self.hover)] * rise]
+        way = straight(path[-1], np.append(place, self.hover), travel)
+        path += [np.append(point[:2], self.hover) for point in way] if far else way
         return self._close_and_lift(path, place, idle, lift_steps)
 
     def pick_and_lift(self) -> np.ndarray:
@@ -296,8 +250,7 @@ class GraspExpert:
 
         :return: (n, 4) actions.
         """
-        here = self.table.target
-        place = self._search()
+        here, place = self.table.target, self._search()
         travel, _ = self._travel_steps(place - here[:2])
         path = [here[:3], *straight(here[:3], np.append(place, self.hover), travel)]
         return self._close_and_lift(path, place, int(self._rng.integers(3)), self._lift_steps)
@@ -307,14 +260,13 @@ class GraspExpert:
         """Go on from the end of a path above an object's place (2,): wait, drop, close, lift."""
         above, below, top = (np.append(place, z) for z in (self.hover, self._low, self._top))
         path = [*path, *[above] * idle, *straight(above, below, self._drop_steps)]
-        opened = len(path) - 1
-        return moves([*path, below, *straight(below, top, lift_steps)], opened=opened)
+        return moves([*path, below, *straight(below, top, lift_steps)], opened=len(path) - 1)
 
     def _reserve(self, steps_left: int) -> int:
         """Hurry if there is little time; return the control periods that placing will take."""
-        table = self.table
         if self.lifts:
             return 0
+        table = self.table
         start, goal = table.object_poses()[0, :2], table.goal_poses[0, :2]
         # The grasp may be beside the origin, and the object may shift: 3 cm more.
         reach, carry = (self._travel_steps(np.abs(way) + 0.03)[1] for way in (
@@ -326,13 +278,8 @@ class GraspExpert:
                 setattr(self, name, getattr(self, name) - 1)
         return carry + self._drop_steps + self._config.hold + 2 + self._walk_steps
 
-    def place(self, steps_left: int) -> np.ndarray:
-        """
-        Plan to carry the object to its goal, let go, leave and walk about.
-
-        :param steps_left: control periods until the episode ends.
-        :return: (n, 4) actions; they may not suffice to reach the goal.
-        """
+    def _place(self, steps_left: int) -> np.ndarray:
+        """Plan to carry the object towards its goal, let go, leave and walk about."""
         table, rng = self.table, self._rng
         here = table.target[:3]
         gap = table.goal_poses[0, :2] - table.object_poses()[0, :2]
@@ -341,16 +288,16 @@ class GraspExpert:
         free = steps_left - self._drop_steps - 2 - self._walk_steps
         hold = int(np.clip(free - fastest, 0, self._config.hold))
         travel = min(travel, max(free - hold, fastest))
-        above = np.append(end, here[2])
-        below, leave = np.append(end, self._low + 0.003), np.append(end, self.hover)
-        path = [here] + straight(here, above, travel) + straight(above, below, self._drop_steps)
-        path += [below] * hold
+        above, below, leave = (
+            np.append(end, z) for z in (here[2], self._low + 0.003, self.hover))
+        path = [here, *straight(here, above, travel), *straight(above, below, self._drop_steps),
+                *[below] * hold]
         closed = len(path) - 1
         path += [below, leave]
         wiggle, reach = self._config.wiggle, RANGE * GRIP_SPREAD
         while len(path) <= steps_left:
-            path.append(path[-1] + rng.normal(0, [wiggle, wiggle, wiggle / 3]))
-            path[-1] = np.clip(path[-1], [-reach, -reach, CLEAR], [reach, reach, 0.14])
+            path.append(np.clip(path[-1] + rng.normal(0, [wiggle, wiggle, wiggle / 3]),
+                                [-reach, -reach, CLEAR], [reach, reach, 0.14]))
         return moves(path, closed=closed)[:steps_left]
 
     def _travel_steps(self, way: np.ndarray) -> tuple[int, int]:
@@ -378,8 +325,7 @@ class GraspExpert:
 
     def _costs(self, places: np.ndarray) -> np.ndarray:
         """Grasp at all places (N, 2) in the true simulator; return (N,) metres not lifted."""
-        table = self.table
-        lift = self._top - self._low
+        table, held, lift = self.table, self._held, self._top - self._low
         grasp = self._drop_steps + 1
         actions = np.zeros((grasp + self._lift_steps + 1, 4))  # the last one holds still
         actions[:self._drop_steps, 2] = (self._low - self.hover) / self._drop_steps
@@ -389,28 +335,12 @@ class GraspExpert:
         controls = np.tile(controls, (len(places), 1, 1))
         controls[..., :2] += places[:, None]
         states = np.tile(table.state(), (len(places), 1))
-        states[:, 1:3], states[:, 3] = places, self.hover
-        states[:, 4:6] = controls[:, :1, 3:].squeeze(1)
-        ends = table.rollout(states, controls)
-        before = table.object_poses()[:, :3]
-        after = ends[:, -1, 1 + OBJECT_QPOS_START:1 + table.model.nq].reshape(
-            len(places), -1, 7)
-        poses = after[:, self._held]
-        lifted = poses[:, 2] - before[self._held, 2]
-        moved = np.delete(np.linalg.norm(after[..., :3] - before, axis=-1), self._held, axis=1)
+        states[:, 1:3], states[:, 3], states[:, 4:6] = places, self.hover, controls[:, 0, 3:]
+        after = objects_in(table.rollout(states, controls)[:, -1], table.model)
+        before, poses = table.object_poses()[:, :3], after[:, held]
+        moved = np.delete(np.linalg.norm(after[..., :3] - before, axis=-1), held, axis=1)
         lost = np.linalg.norm(poses[:, :2] - places, axis=1) > LOST
-        upright = 1 - 2 * (poses[:, 4] ** 2 + poses[:, 5] ** 2)
         # What is lifted but for a centimetre is as good as can be: then the centre decides.
-        return lift - np.clip(lifted, 0, lift - 0.01) + 0.1 * (
-            (upright < 0.95) | lost) + OTHERS * moved.sum(1) + OFF_CENTRE * np.linalg.norm(
-                places - before[self._held, :2], axis=1)
-
-
-def _plans(expert: GraspExpert, num_frames: int) -> Iterator[np.ndarray]:
-    """Yield the actions of one episode; each waits until those before are carried out."""
-    table, steps_left = expert.table, num_frames - 1
-    for plan in (expert.pick, expert.place)[:1 if expert.lifts else 2]:
-        actions = plan(steps_left)
-        yield actions
-        steps_left -= len(actions)
-    yield np.tile([0, 0, 0, table.target[3]], (max(steps_left, 0), 1))  # hold still
+        return lift - np.clip(poses[:, 2] - before[held, 2], 0, lift - 0.01) + 0.1 * (
+            (upright(poses) < 0.95) | lost) + OTHERS * moved.sum(1) + OFF_CENTRE * np.linalg.norm(
+                places - before[held, :2], axis=1)

@@ -9,17 +9,27 @@ goes to where the second stood. The gripper begins beside the first, away from t
 begins with that one pushes what stands on its goal outwards, where the gripper cannot get behind
 it any more.
 
-Before each push the expert tries all orders in the simulator, see pushes.find_order.
+Before each push the expert tries all orders in the simulator, see find_order.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import ClassVar
 
 import numpy as np
-from sim_bridge.tasks.push import GOAL_DISTANCE, OBJECT_RANGE, PushTask, with_yaws
+from sim_bridge.tasks.motions import after_plans, direction, Moment, Push, push_actions
+from sim_bridge.tasks.push import (
+    Expert,
+    GOAL_DISTANCE,
+    OBJECT_RANGE,
+    PushTask,
+    TILT_COST,
+    with_yaws,
+)
 from sim_bridge.tasks.tasks import apart, TaskScene
 from sim_bridge.world.scene import ObjectShape, random_shape
-from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE
+from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE, Table
 from tap_ros.base.contract import WORKSPACE_HIGH
 
 EDGE_RANGE = (0.35, 0.38)  # m from the middle, where the object at the edge stands
@@ -30,6 +40,10 @@ ORDER_SEPARATION = 0.17  # m between object origins at the start, and between go
 FREE_WAY = 0.13  # m, least from a way to the objects that stand beside it, in the right order
 BEHIND = 0.13  # m, where a push begins
 HAND_DISTANCE = (GRIPPER_MARGIN, 0.24)  # m from the first object of the chain to the gripper
+# The search for an order: pushes of each object at each place in it; the first goes straight.
+SAMPLES = 10
+ANGLE_STD, OFFSET_STD, OVERSHOOT_STD = 0.25, 0.015, 0.02  # rad, m, m
+SPEED, TRAVEL_SPEED = 0.05, 0.08  # m per control period
 
 
 @dataclass(frozen=True)
@@ -42,25 +56,24 @@ class OrderTask(PushTask):
 
     def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
         """Draw a scene in which the order of pushes matters."""
-        shapes = draw_shapes(rng, self.num_objects)
+        while True:  # they do not touch each other ORDER_SEPARATION apart, whatever their yaw
+            shapes = tuple(random_shape(rng) for _ in range(self.num_objects))
+            if sum(sorted(map(_radius, shapes))[-2:]) < ORDER_SEPARATION:
+                break
         starts, goals, hand = draw_chain(rng, self.num_objects)
         # So that a name, or a place in a list, does not tell the order.
         names = rng.permutation(self.num_objects)
         starts[names], goals[names] = starts.copy(), goals.copy()
         start_poses, goal_poses = with_yaws(rng, starts, goals)
-        return TaskScene(shapes, start_poses, goal_poses, hand, tuple(int(k) for k in names[::-1]))
+        return TaskScene(shapes, start_poses, goal_poses, hand, tuple(names[::-1].tolist()))
+
+    def next_object(self, expert: Expert, todo: Sequence[int]) -> int:
+        """Return the first in the best order."""
+        return find_order(expert.table, Moment.of(expert.table), expert.goals, todo, expert.rng)[0]
 
 
 ORDER2 = OrderTask('order2', num_objects=2, num_frames=55, stream=6)
 ORDER3 = OrderTask('order3', num_objects=3, num_frames=90, stream=7)
-
-
-def draw_shapes(rng: np.random.Generator, count: int) -> tuple[ObjectShape, ...]:
-    """Draw shapes that do not touch each other ORDER_SEPARATION apart, whatever their yaw."""
-    while True:
-        shapes = tuple(random_shape(rng) for _ in range(count))
-        if sum(sorted(_radius(shape) for shape in shapes)[-2:]) < ORDER_SEPARATION:
-            return shapes
 
 
 def draw_chain(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,7 +92,7 @@ def draw_chain(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.nda
             continue
         away = starts[0] - goals[0]
         angle = np.arctan2(away[1], away[0]) + rng.uniform(-1, 1)
-        hand = starts[0] + rng.uniform(*HAND_DISTANCE) * _along(angle)
+        hand = starts[0] + rng.uniform(*HAND_DISTANCE) * direction(angle)
         gaps = np.linalg.norm(starts - hand, axis=1)
         if gaps.min() >= GRIPPER_MARGIN and gaps.argmin() == 0 and _inside(hand, GRIPPER_RANGE):
             return starts, goals, np.append(hand, rng.uniform(0, GRIPPER_HEIGHT))
@@ -91,11 +104,11 @@ def _at_the_edge(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.n
     turn = np.array([[np.cos(edge), -np.sin(edge)], [np.sin(edge), np.cos(edge)]])
     starts, goals = np.empty((2, count, 2))
     starts[-1] = rng.uniform(*EDGE_RANGE), rng.uniform(-OBJECT_RANGE, OBJECT_RANGE)
-    goals[-1] = starts[-1] + GOAL_DISTANCE * _along(rng.choice([-1, 1]) * rng.uniform(*ALONG))
+    goals[-1] = starts[-1] + GOAL_DISTANCE * direction(rng.choice([-1, 1]) * rng.uniform(*ALONG))
     for k in range(count - 2, -1, -1):
-        goals[k] = starts[k + 1] + rng.uniform(0, NEAR) * _along(rng.uniform(0, 2 * np.pi))
+        goals[k] = starts[k + 1] + rng.uniform(0, NEAR) * direction(rng.uniform(0, 2 * np.pi))
         most = OUTWARDS if k == count - 2 else np.pi
-        starts[k] = goals[k] - GOAL_DISTANCE * _along(rng.uniform(-most, most))
+        starts[k] = goals[k] - GOAL_DISTANCE * direction(rng.uniform(-most, most))
     return starts @ turn.T, goals @ turn.T
 
 
@@ -118,13 +131,49 @@ def _inside(positions: np.ndarray, limit: float) -> bool:
     return bool((np.abs(positions) <= limit).all())
 
 
-def _along(angle: float) -> np.ndarray:
-    return np.array([np.cos(angle), np.sin(angle)])
-
-
 def _radius(shape: ObjectShape) -> float:
     """Return how far a shape reaches from its origin, in m."""
     if shape.kind == 'disc':
         return shape.half_sizes[0][0]
     return max(float(np.linalg.norm(np.abs(centre) + np.array(size)[:2]))
                for centre, size in zip(shape.centres, shape.half_sizes))
+
+
+def find_order(table: Table, moment: Moment, goals: np.ndarray, todo: Sequence[int],
+               rng: np.random.Generator) -> tuple[int, ...]:
+    """
+    Try all orders of pushing objects, one push for each, and return the best.
+
+    :param moment: from which it is pushed.
+    :param goals: (K, 3) m, of all objects.
+    :param todo: the objects to be pushed.
+    :param rng: numpy Generator.
+    :return: todo in the order after which all objects lie nearest to their goals.
+    """
+    after: dict[tuple[int, ...], tuple[Moment, float]] = {(): (moment, 0.0)}
+    orders = list(permutations(todo))
+    for order in orders:
+        for n in range(1, len(order) + 1):
+            if order[:n] not in after:
+                before, _ = after[order[:n - 1]]
+                after[order[:n]] = best_push(table, before, goals, order[n - 1], rng)
+    return min(orders, key=lambda order: after[order][1])
+
+
+def best_push(table: Table, moment: Moment, goals: np.ndarray, k: int,
+              rng: np.random.Generator) -> tuple[Moment, float]:
+    """
+    Sample pushes of object k and take the one after which least is missing.
+
+    :return: the moment after it, and what then is missing: m, summed over all objects.
+    """
+    place, goal = moment.places[k, :2], goals[k, :2]
+    straight = np.arctan2(goal[1] - place[1], goal[0] - place[0])
+    spread = rng.normal(size=(SAMPLES, 3)) * (ANGLE_STD, OFFSET_STD, OVERSHOOT_STD)
+    spread[0] = 0
+    after, topples = after_plans(table, moment, [
+        push_actions(Push(straight + angle, offset, overshoot, SPEED, TRAVEL_SPEED),
+                     moment.target, place, goal) for angle, offset, overshoot in spread])
+    missing = np.linalg.norm(after.places - goals, axis=-1) + TILT_COST * topples  # (N, K)
+    best = int(missing.sum(1).argmin())
+    return Moment(*(part[best] for part in after)), float(missing[best].sum())

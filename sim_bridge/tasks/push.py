@@ -3,23 +3,19 @@
 """
 Pushing in any order: scenes, goals, and the expert that generates the data (App. D).
 
-The rules of the scenes are those of the paper's authors (their cartgripper environment): object
-origins within 0.35 m of the middle, starts at least 0.35 m apart (0.3 m with three objects), every
-goal exactly 0.2 m from its start and at least 0.2 m from the other goals, yaw changed by at most
-0.2 rad. Doing nothing therefore ends 20 cm from the goals.
+The rules of the scenes are those of the paper's authors (their cartgripper environment). Every
+goal is 0.2 m from its start: doing nothing ends 20 cm from the goals.
 
 The expert is a cross-entropy method with the true simulator. A sample is one push: go behind an
-object, come down, push. Samples are rolled out in the true physics, all at once; the best are
-refitted; the best push of all is executed and the search begins anew from where things then lie.
-The object nearest to the gripper mostly comes first, and is mostly brought home before the next
-one is touched. How fast and how far it is pushed, and whether that succeeds, varies from episode
-to episode, as the paper's non-deterministic planner gives. Proposing whole pushes rather than
-independent displacements is our deviation: a few dozen samples then suffice.
+object, come down, push. All are rolled out in the true physics, the best are refitted, the best of
+all is executed, and the search begins anew. The object nearest to the gripper mostly comes first,
+and is mostly brought home before the next one is touched. How fast and how far it is pushed, and
+whether that succeeds, varies from episode to episode, as the paper's non-deterministic planner
+gives. Whole pushes rather than independent displacements are our deviation: a few dozen suffice.
 
 Timing says when the bottleneck comes: the first object is home, the others are untouched. The
 expert makes it late by wandering before its first push, and early by interrupting the second one:
-it pushes an object a part of the way, wanders, and comes back. Everything it does is done in the
-simulator; no picture is moved in time.
+it pushes an object a part of the way, wanders, and comes back.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,25 +23,17 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sim_bridge.tasks.pushes import (
+from sim_bridge.tasks.motions import (
     after_plans,
-    draw_share,
-    find_order,
+    carry_out,
+    direction,
+    EpisodeRun,
     Moment,
+    moves,
     Push,
     push_actions,
-    TILT_COST,
-    timed_plans,
 )
-from sim_bridge.tasks.tasks import (
-    apart,
-    carry_out,
-    Demonstration,
-    EpisodeRun,
-    moves,
-    Task,
-    TaskScene,
-)
+from sim_bridge.tasks.tasks import apart, DemonstrationOptions, Task, TaskScene
 from sim_bridge.world.scene import random_shape
 from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE, lifted, Table
 from sim_bridge.world_protocol import Observation
@@ -59,7 +47,15 @@ GOAL_SEPARATION = 0.2  # m between goals
 GRIPPER_NEAR = 0.2  # m, at most, to the object that is pushed first
 STILL = 0.002  # m, an object within this of its last place has come to rest
 MISS = 0.1  # m, at most, from the object's origin to the way of a push at random
+TILT_COST = 0.2  # m, of an object that topples
+SHARES = {'early': (0.2, 0.35), 'middle': (0.4, 0.6), 'late': (0.7, 0.85)}  # of the episode
 MORE_FRAMES = 40  # that an episode may have beyond its task's, so that there is time to wander
+# Control periods that things take, about:
+PUSH = 14  # a push, from wherever the gripper is,
+GAP = 9  # of these until the object is touched,
+AGAIN = 3  # on average, pushes that have to be repeated
+RETURN = 6  # to leave an object and come back to it
+DETOUR = 16  # a push is interrupted once for so many
 
 
 @dataclass(frozen=True)
@@ -84,69 +80,57 @@ class PushTask(Task):
             if apart(starts, self.start_separation):
                 goals = _draw_goals(rng, starts)
         start_poses, goal_poses = with_yaws(rng, starts, goals)
-        hand = gripper_beside_one(rng, starts)
-        return TaskScene(shapes, start_poses, goal_poses, hand,
-                         tuple(nearest_first(hand[:2], starts, goals)))
+        # The gripper touches no object and is near one, so that the start picture tells which is
+        # pushed first, also where a goal picture with the arm elsewhere does not tell the last.
+        hand = starts[0]
+        while np.linalg.norm(starts - hand, axis=1).min() < GRIPPER_MARGIN or (
+                np.abs(hand) > GRIPPER_RANGE).any():
+            angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(GRIPPER_MARGIN, GRIPPER_NEAR)
+            hand = starts[rng.integers(len(starts))] + distance * direction(angle)
+        return TaskScene(shapes, start_poses, goal_poses,
+                         np.append(hand, rng.uniform(0, GRIPPER_HEIGHT)),
+                         tuple(nearest_first(hand, starts, goals)))
 
     def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
         """Return where the gripper touches the object that it has pushed to its goal last."""
-        starts, goals = scene.start_poses[:, :2], scene.goal_poses[:, :2]
-        k = scene.order[-1]
-        along = (goals[k] - starts[k]) / np.linalg.norm(goals[k] - starts[k])
+        start, goal = (poses[scene.order[-1], :2]
+                       for poses in (scene.start_poses, scene.goal_poses))
+        along = (goal - start) / np.linalg.norm(goal - start)
         with table.unmoved():
             for behind in np.arange(0.04, 0.16, 0.005):
-                gripper = np.append(goals[k] - behind * along, 0.01)
+                gripper = np.append(goal - behind * along, 0.01)
                 table.place(lifted(scene.goal_poses), gripper)
                 if not table.touching():
                     break
         return gripper
 
+    def next_object(self, expert: 'Expert', todo: Sequence[int]) -> int:
+        """Return which of the objects that are not in place yet, two at least, is pushed next."""
+        return expert.first if expert.first in todo else expert.nearest(todo)
+
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
-                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+                    rng: np.random.Generator, how: DemonstrationOptions) -> EpisodeRun:
         """Push, from the first motion of the arm to the last of an object."""
         natural = how.timing == 'natural'
         num_frames = how.num_frames or self.num_frames + (0 if natural else MORE_FRAMES)
         expert = Expert(self, table, rng, ExpertConfig() if natural else TIMED_CONFIG, how.misses)
-        plans = (_plans(expert, num_frames) if natural else
-                 timed_plans(expert, draw_share(how.timing, rng), num_frames, rng))
-        observations, actions, outcome = carry_out(
-            table, self.succeeds, first, plans, num_frames)
-        length = _last_motion(np.array([o.object_poses[:, :3] for o in observations])) + 1
+        seen, actions, outcome = carry_out(
+            table, self.succeeds, first,
+            expert.plans(num_frames) if natural else expert.timed_plans(how.timing, num_frames),
+            num_frames)
+        places = np.array([one.object_poses[:, :3] for one in seen])  # (T, K, 3)
+        moving = np.flatnonzero(np.linalg.norm(places - places[-1], axis=-1).max(1) > STILL)
+        length = moving[-1] + 2 if len(moving) else len(seen)
         done = np.concatenate([actions[:length - 1], np.zeros((1, 4), np.float32)])
-        return observations[:length], done, outcome
+        return seen[:length], done, outcome
 
 
 PUSH2 = PushTask('push2', num_objects=2, num_frames=50, stream=2, start_separation=0.35)
 PUSH3 = PushTask('push3', num_objects=3, num_frames=85, stream=3, start_separation=0.3)
 
 
-def gripper_beside_one(rng: np.random.Generator, positions: np.ndarray) -> np.ndarray:
-    """
-    Draw a place of the gripper that touches no object and is near one of them.
-
-    So the start picture tells which object is pushed first, also where a goal picture with the
-    arm elsewhere does not tell which was last.
-
-    :param rng: numpy Generator.
-    :param positions: (K, 2) object origins in metres, at least GRIPPER_MARGIN apart.
-    :return: (3,) metres.
-    """
-    while True:
-        angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(GRIPPER_MARGIN, GRIPPER_NEAR)
-        xy = positions[rng.integers(len(positions))] + distance * np.array(
-            [np.cos(angle), np.sin(angle)])
-        away = np.linalg.norm(positions - xy, axis=1)
-        if (away >= GRIPPER_MARGIN).all() and (np.abs(xy) <= GRIPPER_RANGE).all():
-            return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
-
-
 def nearest_first(hand: np.ndarray, starts: np.ndarray, goals: np.ndarray) -> list[int]:
-    """
-    Order objects as the expert mostly takes them: always the one nearest to the gripper.
-
-    :param hand: (2,) metres, where the gripper is; starts (K, 2), goals (K, 2) of the objects.
-    :return: list of K object indices.
-    """
+    """Return objects as the expert mostly takes them: always the nearest to the gripper (2,)."""
     order, left = [], list(range(len(starts)))
     while left:
         k = min(left, key=lambda i: np.linalg.norm(starts[i] - hand))
@@ -167,8 +151,7 @@ def with_yaws(rng: np.random.Generator, starts: np.ndarray,
 def _draw_goals(rng: np.random.Generator, starts: np.ndarray) -> np.ndarray | None:
     """Draw a goal at the fixed distance from each start; None when there seems to be no room."""
     for _ in range(1000):
-        angles = rng.uniform(0, 2 * np.pi, len(starts))
-        goals = starts + GOAL_DISTANCE * np.column_stack([np.cos(angles), np.sin(angles)])
+        goals = starts + GOAL_DISTANCE * direction(rng.uniform(0, 2 * np.pi, len(starts)))
         if (np.abs(goals) <= OBJECT_RANGE).all() and apart(goals, GOAL_SEPARATION):
             return goals
     return None
@@ -191,14 +174,17 @@ class ExpertConfig:
     push_speed: tuple[float, float] = (0.03, 0.055)
 
 
+# Corrections would move the bottleneck; an object that has arrived is left alone.
+TIMED_CONFIG = ExpertConfig(
+    num_samples=(16, 24), explore=0.03, done_distance=0.035, travel_speed=(0.07, 0.08))
+
+
 class Expert:
     """
-    Plans pushes for one episode.
+    Plans one episode of pushes.
 
-    :param task: PushTask.
-    :param table: Table with its scene.
+    :param table: Table with a scene of the task.
     :param rng: numpy Generator; every whim of this expert comes from it.
-    :param config: ExpertConfig.
     :param misses: share of the pushes that are at random instead of searched.
     :ivar first: the object nearest to where the gripper started, wherever it walked since.
     """
@@ -210,125 +196,140 @@ class Expert:
         self.goals = table.goal_poses[:, :3]
         self._num_samples = rng.integers(*config.num_samples, endpoint=True)
         self._preference = rng.uniform(0, config.preference, task.num_objects)
-        self.first = self.nearest(range(task.num_objects), Moment.of(table))
+        self.first = self.nearest(range(task.num_objects))
 
-    @property
-    def num_objects(self) -> int:
-        """Return K."""
-        return len(self.goals)
-
-    def undone(self) -> list[int]:
-        """Return which objects are not at their goals yet."""
-        places = self.table.object_poses()[:, :3]
-        distances = np.linalg.norm(places - self.goals, axis=1)
-        return np.flatnonzero(distances > self._config.done_distance).tolist()
-
-    def next_object(self) -> int | None:
-        """
-        Choose an object to push: the first in the best order, or `first`, then the nearest.
-
-        :return: its number, or None when all are in place.
-        """
-        todo, now = self.undone(), Moment.of(self.table)
-        if len(todo) < 2:
-            return todo[0] if todo else None
-        if self._task.ordered:
-            return find_order(self.table, now, self.goals, todo, self.rng)[0]
-        return self.first if self.first in todo else self.nearest(todo, now)
-
-    def nearest(self, objects: Sequence[int], now: Moment) -> int:
+    def nearest(self, objects: Sequence[int]) -> int:
         """Return the object nearest to the gripper."""
-        here = np.linalg.norm(now.places[list(objects), :2] - now.target[:2], axis=1)
-        return objects[int(here.argmin())]
+        places = self.table.object_poses()[list(objects), :2]
+        return objects[int(np.linalg.norm(places - self.table.target[:2], axis=1).argmin())]
 
-    def wander(self, steps: int | None = None) -> np.ndarray:
+    def plans(self, num_frames: int) -> Iterator[np.ndarray]:
         """
-        Plan to rise and walk about at random, for example before the first push.
+        Yield a walk, then pushes until all objects are in place.
 
-        Without it, the middle of most episodes is where one object is in place and the other
+        Without the walk, the middle of most episodes is where one object is in place and the other
         untouched, and a prediction for a fixed time finds that bottleneck nearly always.
 
-        :param steps: control periods; None: drawn.
-        :return: (steps, 4) actions.
+        :param num_frames: at most.
+        :return: iterator of (n, 4) actions, each to be carried out before the next is asked for.
         """
-        if steps is None:
-            steps = int(self.rng.integers(*self._config.wander, endpoint=True))
+        plan: np.ndarray | None = self._wander(
+            int(self.rng.integers(*self._config.wander, endpoint=True)))
+        steps_left = num_frames - 1
+        while plan is not None:
+            yield plan
+            steps_left -= len(plan)
+            plan = self._push(self._next_object(self._undone()), steps_left)
+
+    def timed_plans(self, timing: str, num_frames: int) -> Iterator[np.ndarray]:
+        """
+        Yield plans after which the bottleneck has come when it shall; see plans.
+
+        :param timing: one of TIMINGS but 'natural'; 'mixed': any of the others.
+        """
+        rng, count = self.rng, len(self.goals)
+        if timing == 'mixed':
+            timing = str(rng.choice(list(SHARES)))
+        share = rng.uniform(*SHARES[timing])  # of the episode
+        before = (count * PUSH + AGAIN) * share - (PUSH + GAP / 2)
+        waiting = min(before / (1 - share), num_frames - count * PUSH)
+        plan = self._wander(max(round(waiting), int(rng.integers(1, 3))))
+        done, detours = 0, list[int]()  # control periods so far, and of the interruptions to come
+        current: int | None = None  # the object that is pushed now
+        while plan is not None:
+            yield plan
+            done += len(plan)
+            if detours:
+                yield (plan := self._wander(detours.pop()))
+                done += len(plan)
+            todo = self._undone()
+            if current not in todo:
+                current = self._next_object(todo)
+                if count - len(todo) == 1:  # the second push is interrupted, once or several times
+                    spare = min((done + GAP / 2) / share, num_frames) - done - (count - 1) * PUSH
+                    times = max(round(spare / DETOUR), 1) if spare >= RETURN else 0
+                    detours = [max(int(spare / times) - RETURN, 1)] * times if times else []
+            plan = self._push(current, num_frames - 1 - done, 1 / (1 + len(detours)))
+
+    def _undone(self) -> list[int]:
+        """Return which objects are not at their goals yet."""
+        gaps = np.linalg.norm(self.table.object_poses()[:, :3] - self.goals, axis=1)
+        return np.flatnonzero(gaps > self._config.done_distance).tolist()
+
+    def _next_object(self, todo: list[int]) -> int | None:
+        """Choose an object to push of those that are not in place; None when all are."""
+        return self._task.next_object(self, todo) if len(todo) > 1 else todo[0] if todo else None
+
+    def _wander(self, steps: int) -> np.ndarray:
+        """Plan to rise and walk about at random for so many control periods."""
         # As fast as it travels: pictures of a slow walk would be easy to predict from the start.
         angles = self.rng.uniform(0, 2 * np.pi, steps)
         lengths = self.rng.uniform(*self._config.travel_speed, steps)
         here = self.table.target[:3]
-        path = here[:2] + np.cumsum(
-            lengths[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 0)
+        path = here[:2] + np.cumsum(lengths[:, None] * direction(angles), 0)
         path = np.clip(path, WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])
         return moves([here, *np.column_stack([path, np.full(steps, LIFTED)])])
 
-    def plan(self, steps_left: int, only: int | None = None,
-             part: float = 1.0) -> np.ndarray | None:
+    def _push(self, first: int | None, steps_left: int, part: float = 0) -> np.ndarray | None:
         """
         Search for the next push.
 
+        :param first: the object to be pushed; None: all are in place.
         :param steps_left: control periods until the episode ends.
-        :param only: the object to be pushed; None: any, mostly next_object.
-        :param part: of the way that object is pushed.
+        :param part: of the way that this object is pushed; 0: all of it, and sometimes another.
         :return: (n, 4) actions, or None when every object is in place.
         """
-        now, todo = Moment.of(self.table), self.undone()
-        first = self.next_object() if only is None else only
-        if not todo or first is None:
+        if first is None:
             return None
-        if self._misses and self.rng.random() < self._misses:
+        config, rng, now = self._config, self.rng, Moment.of(self.table)
+        if self._misses and rng.random() < self._misses:
             return self._random_push(now, steps_left)
-        goals = self.goals
-        if only is not None or self._task.ordered:
-            todo = [first]
-            goals = goals.copy()
-            goals[first] = now.places[first] + part * (goals[first] - now.places[first])
-        config, rng = self._config, self.rng
+        todo, goals = self._undone(), self.goals
+        if part or self._task.ordered:
+            todo, goals = [first], goals.copy()
+            goals[first] = now.places[first] + (part or 1) * (goals[first] - now.places[first])
 
         def actions_of(sample: np.ndarray) -> np.ndarray:
-            k = int(sample[0])
-            return push_actions(Push(*sample[1:]), now.target, now.places[k, :2],
-                                goals[k, :2])[:steps_left]
+            k, push = int(sample[0]), Push(*sample[1:])
+            return push_actions(push, now.target, now.places[k, :2], goals[k, :2])[:steps_left]
 
         def cost(samples: np.ndarray) -> np.ndarray:
-            costs = self._costs(now, [actions_of(sample) for sample in samples], goals, first)
+            plans = [actions_of(sample) for sample in samples]
+            after, topples = after_plans(self.table, now, plans)
+            ends = np.linalg.norm(after.places - goals, axis=-1)  # (N, K)
+            untouched = np.abs(ends - np.linalg.norm(now.places - goals, axis=1)) < 0.005
+            costs = ends.sum(1) + TILT_COST * topples.sum(1)
+            costs += config.step_cost * np.array(list(map(len, plans)))
+            costs += (untouched * self._preference).sum(1)
+            costs += config.nearest * untouched[:, first]
             if rng.random() < config.explore:
                 costs[0] = -np.inf  # whatever comes of it
             return costs
 
         best, _ = cross_entropy(
-            lambda elites: self._sample(todo, now.places, goals, elites), cost,
+            lambda elites: self._sample(todo, goals - now.places, elites), cost,
             config.num_iterations, config.num_elites)
         return actions_of(best[0])
 
     def _random_push(self, now: Moment, steps_left: int) -> np.ndarray:
-        """
-        Aim at any object from anywhere, then go on low, in other directions or back.
-
-        So that objects are hit, grazed and missed, and the gripper leaves them without lifting.
-        """
+        """Aim at any object from anywhere, hit, graze or miss it, and go on low, also back."""
         rng, config = self.rng, self._config
-        k = rng.integers(self.num_objects)
+        k = rng.integers(len(self.goals))
         push = Push(
             rng.uniform(0, 2 * np.pi), rng.uniform(-MISS, MISS), rng.uniform(-0.1, 0.05),
             rng.uniform(*config.push_speed), rng.uniform(*config.travel_speed))
         actions = push_actions(push, now.target, now.places[k, :2], self.goals[k, :2])
-        here = now.target[:3] + actions[:, :3].sum(0)
-        path = [here]
+        path = [now.target[:3] + actions[:, :3].sum(0)]
         for _ in range(rng.integers(1, 4)):
             angle, speed = rng.uniform(0, 2 * np.pi), rng.uniform(*config.push_speed)
-            step = speed * np.array([np.cos(angle), np.sin(angle), 0])
+            step = speed * np.append(direction(angle), 0)
             path += [path[-1] + i * step for i in range(1, rng.integers(2, 6))]
         further = moves(np.clip(path, WORKSPACE_LOW, WORKSPACE_HIGH))
         return np.concatenate([actions, further])[:steps_left]
 
-    def _sample(self, todo: Sequence[int], places: np.ndarray, goals: np.ndarray,
+    def _sample(self, todo: Sequence[int], gaps: np.ndarray,
                 elites: np.ndarray | None) -> np.ndarray:
-        """
-        Draw (N, 6): objects, and pushes of them.
-
-        :param elites: pushes like those of the object that the best one pushes; None: others.
-        """
+        """Draw (N, 6): objects and pushes of them; or like elites', of that of the best one."""
         rng, config = self.rng, self._config
         if elites is not None:
             todo = [int(elites[0, 0])]
@@ -338,45 +339,12 @@ class Expert:
         for _ in range(self._num_samples):
             k = int(rng.choice(todo))
             if elites is None:
-                gap = goals[k, :2] - places[k, :2]
-                push = np.array([
-                    np.arctan2(gap[1], gap[0]) + rng.normal(0, 0.35), rng.normal(0, 0.025),
-                    rng.normal(0, 0.03), rng.uniform(*config.push_speed)])
+                turn, offset, overshoot = rng.normal(0, (0.35, 0.025, 0.03))
+                angle = np.arctan2(gaps[k, 1], gaps[k, 0]) + turn
+                speed = rng.uniform(*config.push_speed)
             else:
-                push = rng.normal(mean, spread)
-                push[3] = np.clip(push[3], *config.push_speed)
-            samples.append([k, *push, rng.uniform(*config.travel_speed)])
+                angle, offset, overshoot, speed = rng.normal(mean, spread)
+                speed = np.clip(speed, *config.push_speed)
+            samples.append([
+                k, angle, offset, overshoot, speed, rng.uniform(*config.travel_speed)])
         return np.array(samples)
-
-    def _costs(self, now: Moment, plans: Sequence[np.ndarray], goals: np.ndarray,
-               first: int) -> np.ndarray:
-        """Roll all plans out in the true simulator; return (N,) metres."""
-        moments, upright = after_plans(self.table, now, plans)
-        ends = np.linalg.norm(np.array([m.places for m in moments]) - goals, axis=-1)  # (N, K)
-        costs = ends.sum(1) + TILT_COST * (~upright).sum(1)
-        costs += self._config.step_cost * np.array([len(plan) for plan in plans])
-        untouched = np.abs(ends - np.linalg.norm(now.places - goals, axis=1)) < 0.005
-        return costs + (untouched * self._preference).sum(1) + self._config.nearest * untouched[
-            :, first]
-
-
-# Corrections would move the bottleneck; an object that has arrived is left alone.
-TIMED_CONFIG = ExpertConfig(
-    num_samples=(16, 24), explore=0.03, done_distance=0.035, travel_speed=(0.07, 0.08))
-
-
-def _plans(expert: Expert, num_frames: int) -> Iterator[np.ndarray]:
-    """Yield a walk, then pushes until all objects are in place."""
-    plan: np.ndarray | None = expert.wander()
-    steps_left = num_frames - 1
-    while plan is not None:
-        yield plan
-        steps_left -= len(plan)
-        plan = expert.plan(steps_left)
-
-
-def _last_motion(positions: np.ndarray) -> int:
-    """Return the first frame from which on no object moves; positions (T, K, 3) metres."""
-    away = np.linalg.norm(positions - positions[-1], axis=-1).max(1) > STILL
-    moving = np.flatnonzero(away)
-    return min(moving[-1] + 1, len(positions) - 1) if len(moving) else len(positions) - 1

@@ -9,21 +9,13 @@ episode ends when the last block is let go: frames after that would show the goa
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from operator import itemgetter
 from typing import ClassVar
 
 import numpy as np
 from sim_bridge.tasks.grasp import GRASP_HEIGHT, GRASP_YAW, GraspConfig, GraspExpert
-from sim_bridge.tasks.tasks import (
-    apart,
-    carry_out,
-    Demonstration,
-    EpisodeRun,
-    moves,
-    straight,
-    Task,
-    TaskScene,
-)
+from sim_bridge.tasks.motions import carry_out, EpisodeRun, moves, straight
+from sim_bridge.tasks.tasks import apart, DemonstrationOptions, Task, TaskScene
 from sim_bridge.world.scene import HALF_HEIGHT, ObjectShape
 from sim_bridge.world.table import GRIPPER_HEIGHT, Table
 from sim_bridge.world_protocol import Observation
@@ -54,19 +46,34 @@ class StackTask(Task):
     gripping: ClassVar[bool] = True
 
     def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
-        """Draw blocks to be stacked; all but the first one are moved."""
-        shapes = tuple(draw_block(rng) for _ in range(self.num_objects))
-        starts, goals, hand = draw_blocks(rng, self.num_objects, spread)
-        return TaskScene(shapes, starts, goals, hand, tuple(range(1, self.num_objects)))
+        """Draw blocks with a square base that fingers can hold; all but the first are moved."""
+        count, shapes = self.num_objects, []
+        for _ in range(count):
+            width = rng.uniform(*BLOCK_HALF_WIDTH)
+            colour = tuple(rng.uniform(0.3, 1.0, 3))
+            shapes.append(
+                ObjectShape('bar', ((width, width, HALF_HEIGHT),), ((0, 0),), (colour,)))
+        places = np.zeros((count, 2))
+        while not apart(places, BLOCK_SEPARATION):
+            places = spread * rng.uniform(-BLOCK_RANGE, BLOCK_RANGE, (count, 2))
+        yaws = rng.uniform(-GRASP_YAW, GRASP_YAW, count)
+        hand = places[0]
+        while np.linalg.norm(places - hand, axis=1).min() < HAND_MARGIN:
+            hand = spread * rng.uniform(-HAND_RANGE, HAND_RANGE, 2)
+        # On the first block, in line with x and y: closing fingers turn what they hold.
+        goals = np.tile([*places[0], 0], (count, 1))
+        goals[0, 2] = yaws[0]
+        return TaskScene(tuple(shapes), np.column_stack([places, yaws]), goals,
+                         np.append(hand, rng.uniform(0, GRIPPER_HEIGHT)), tuple(range(1, count)))
 
     @property
     def goal_heights(self) -> np.ndarray:
         """Return how high above the table the blocks of a tower stand, (K,) m."""
-        return levels(self.num_objects)
+        return 2 * HALF_HEIGHT * np.arange(self.num_objects)
 
     def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
         """Return where the open gripper has just let go of the top of the tower."""
-        top = levels(self.num_objects)[-1]
+        top = self.goal_heights[-1]
         return np.array([*scene.goal_poses[-1, :2], top + GRASP_HEIGHT, 1])
 
     def succeeds(self, table: Table) -> bool:
@@ -74,11 +81,10 @@ class StackTask(Task):
         return is_tower(table.object_poses()) and not table.touching()
 
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
-                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+                    rng: np.random.Generator, how: DemonstrationOptions) -> EpisodeRun:
         """Act until the last block is let go; the outcome is that after SETTLE_STEPS more."""
-        mover = PickAndPlace(table, rng)
         plans = (plan for k in scene.order
-                 for plan in mover.move(k, partial(_origin, table, k - 1)))
+                 for plan in pick_and_place(table, rng, k, itemgetter(k - 1)))
         observations, actions, _ = carry_out(
             table, self.succeeds, first, plans, how.num_frames or self.num_frames)
         for _ in range(SETTLE_STEPS):
@@ -90,42 +96,6 @@ STACK2 = StackTask('stack2', num_objects=2, num_frames=36, stream=8)
 STACK3 = StackTask('stack3', num_objects=3, num_frames=60, stream=9)
 
 
-def draw_block(rng: np.random.Generator) -> ObjectShape:
-    """Draw a block with a square base that the fingers can hold."""
-    width = rng.uniform(*BLOCK_HALF_WIDTH)
-    colour = tuple(rng.uniform(0.3, 1.0, 3))
-    return ObjectShape('bar', ((width, width, HALF_HEIGHT),), ((0, 0),), (colour,))
-
-
-def draw_blocks(rng: np.random.Generator, count: int,
-                spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Draw where K blocks stand, the tower and the gripper.
-
-    :param rng: numpy Generator.
-    :param count: K.
-    :param spread: factor of the ranges of blocks and gripper.
-    :return: start poses (K, 3) and goal poses (K, 3), all on the first block's start and, as the
-        closing fingers turn what they hold, in line with x and y; (3,) of the gripper in m.
-    """
-    places = np.zeros((count, 2))
-    while not apart(places, BLOCK_SEPARATION):
-        places = spread * rng.uniform(-BLOCK_RANGE, BLOCK_RANGE, (count, 2))
-    yaws = rng.uniform(-GRASP_YAW, GRASP_YAW, count)
-    hand = places[0]
-    while np.linalg.norm(places - hand, axis=1).min() < HAND_MARGIN:
-        hand = spread * rng.uniform(-HAND_RANGE, HAND_RANGE, 2)
-    goals = np.column_stack([np.tile(places[0], (count, 1)), np.zeros(count)])
-    goals[0, 2] = yaws[0]
-    return (np.column_stack([places, yaws]), goals,
-            np.append(hand, rng.uniform(0, GRIPPER_HEIGHT)))
-
-
-def levels(count: int) -> np.ndarray:
-    """Return how high above the table the blocks of a tower stand, (K,) m."""
-    return 2 * HALF_HEIGHT * np.arange(count)
-
-
 def is_tower(poses: np.ndarray) -> bool:
     """Return whether blocks stand on each other; poses (K, 3 or more) m, from the lowest on."""
     up = np.diff(poses[:, :3], axis=0)
@@ -134,61 +104,41 @@ def is_tower(poses: np.ndarray) -> bool:
                 and abs(poses[0, 2] - HALF_HEIGHT) < LEVEL_TOLERANCE)
 
 
-class PickAndPlace:
+def pick_and_place(table: Table, rng: np.random.Generator, k: int,
+                   below: Callable[[np.ndarray], np.ndarray]) -> Iterator[np.ndarray]:
     """
-    Plans the moves of one episode.
+    Yield (n, 4) actions that move an object, each to be carried out before the next is asked for.
 
     :param table: Table with a scene and a gripper that holds.
-    :param rng: numpy Generator; every whim of this planner comes from it.
+    :param rng: numpy Generator of all that varies.
+    :param k: the object to be moved.
+    :param below: says of object_poses (K, 7) where the origin of what is to be below it is, (3 or
+        more,) m, see on_table.
     """
+    def gap() -> np.ndarray:
+        poses = table.object_poses()
+        return below(poses)[:3] + [0, 0, 2 * HALF_HEIGHT] + [0, 0, GAP] - poses[k, :3]
 
-    def __init__(self, table: Table, rng: np.random.Generator) -> None:
-        self._table, self._rng = table, rng
-
-    def move(self, k: int, below: Callable[[], np.ndarray]) -> Iterator[np.ndarray]:
-        """
-        Yield (n, 4) actions, each to be carried out before the next is asked for.
-
-        :param k: the object to be moved.
-        :param below: says (3,) m where the origin of what is to be below it is now, see on_table.
-        """
-        table = self._table
-        grasp = GraspExpert(table, self._rng, CONFIG, k)
-        for _ in range(TRIES):
-            here = table.target
-            if here[2] < CLEAR:  # straight up from among the objects
-                yield np.array([[0, 0, grasp.hover - here[2], here[3]]])
-            yield grasp.pick_and_lift()
-            if table.object_poses()[k, 2] > HELD:
-                break
-        yield self._carry(k, below())
-        yield self._lower(k, below())
-        yield np.array([[0, 0, 0, 0.5], [0, 0, 0, 1]])
-
-    def _carry(self, k: int, below: np.ndarray) -> np.ndarray:
-        """Carry object k above its place."""
-        speed = self._rng.uniform(*CONFIG.travel_speed)
-        gap = self._gap(k, below)
-        path = straight(np.zeros(3), gap, max(1, int(np.ceil(np.linalg.norm(gap) / speed))))
-        return moves([np.zeros(3), *path])
-
-    def _lower(self, k: int, below: np.ndarray) -> np.ndarray:
-        """Bring object k, as it hangs now, down onto what is below it and hold still."""
-        down = below[2] + 2 * HALF_HEIGHT + GAP - self._table.object_poses()[k, 2]
-        above = self._gap(k, below)
-        path = straight(above, above + [0, 0, down], int(self._rng.integers(2, 4)))
-        return moves([np.zeros(3), above, *path, path[-1]])
-
-    def _gap(self, k: int, below: np.ndarray) -> np.ndarray:
-        """Return the way (3,), level, from object k to above its place."""
-        return np.append(below[:2] - self._table.object_poses()[k, :2], 0)
+    grasp, here = GraspExpert(table, rng, CONFIG, k), np.zeros(3)
+    for _ in range(TRIES):
+        height, opening = table.target[2:]
+        if height < CLEAR:  # straight up from among the objects
+            yield np.array([[0, 0, grasp.hover - height, opening]])
+        yield grasp.pick_and_lift()
+        if table.object_poses()[k, 2] > HELD:
+            break
+    speed = rng.uniform(*CONFIG.travel_speed)
+    above = np.append(gap()[:2], 0)
+    steps = max(1, int(np.ceil(np.linalg.norm(above) / speed)))
+    yield moves([here, *straight(here, above, steps)])
+    # Down, as it hangs now, and hold still.
+    down = gap()
+    above = np.append(down[:2], 0)
+    path = straight(above, above + [0, 0, down[2]], int(rng.integers(2, 4)))
+    yield moves([here, above, *path, path[-1]])
+    yield np.array([[0, 0, 0, 0.5], [0, 0, 0, 1]])
 
 
 def on_table(place: np.ndarray) -> np.ndarray:
     """Return the origin (3,) of what would be below an object on the table at (2,) m."""
     return np.append(place, -HALF_HEIGHT)
-
-
-def _origin(table: Table, k: int) -> np.ndarray:
-    """Return where the origin of object k is now, (3,) m."""
-    return table.object_poses()[k, :3]

@@ -7,13 +7,14 @@ push.py, order.py, grasp.py and stack.py have a family each. Another package add
 entry points 'tap_ros.tasks'; their names stand for Task objects.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from sim_bridge.tasks.motions import EpisodeRun
 from sim_bridge.world.scene import ObjectShape
-from sim_bridge.world.table import divided, Table
+from sim_bridge.world.table import Table
 from sim_bridge.world_protocol import Observation
 from tap_ros.base.contract import SUCCESS_DISTANCE, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.base.errors import ConfigError, SceneError
@@ -34,7 +35,7 @@ class TaskScene(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Demonstration:
+class DemonstrationOptions:
     """
     How an expert is to act.
 
@@ -48,12 +49,8 @@ class Demonstration:
     misses: float = 0.0
 
 
-# Observations, (T, 4) float32 actions, of which the last one is zero, and outcome.
-EpisodeRun = tuple[list[Observation], np.ndarray, str]
-
-
 @dataclass(frozen=True)
-class Task:
+class Task(ABC):
     """
     A kind of episode.
 
@@ -77,9 +74,9 @@ class Task:
     ordered: ClassVar[bool] = False
     photographed: ClassVar[bool] = True
 
+    @abstractmethod
     def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
         """Draw a scene; spread is a factor of the ranges in which things to be gripped lie."""
-        raise NotImplementedError
 
     @property
     def goal_heights(self) -> float | np.ndarray:
@@ -99,10 +96,10 @@ class Task:
         """Return whether every object is within SUCCESS_DISTANCE of its goal."""
         return bool((table.distances() < SUCCESS_DISTANCE).all())
 
+    @abstractmethod
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
-                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+                    rng: np.random.Generator, how: DemonstrationOptions) -> EpisodeRun:
         """Let the expert act from the start of a scene, of which `first` is seen."""
-        raise NotImplementedError
 
 
 def task_names() -> list[str]:
@@ -155,54 +152,12 @@ def run_episode(simulator: Any, seed: int, num_frames: int = 0, timing: str = 'n
 
     :param simulator: Simulator; reset here.
     :param seed: of the scene and of the expert.
-    :param num_frames: and the others: see Demonstration.
+    :param num_frames: and the others: see DemonstrationOptions.
     """
     task, first = simulator.task, simulator.reset(seed)
     return task.demonstrate(simulator, simulator.scene, first,
                             np.random.default_rng([seed, task.stream, 1]),
-                            Demonstration(num_frames, timing, misses))
-
-
-def carry_out(table: Table, succeeds: Callable[[Table], bool], first: Observation,
-              plans: Iterable[np.ndarray], num_frames: int) -> EpisodeRun:
-    """
-    Carry out plans until there are no more, or so many frames.
-
-    :param succeeds: as Task.succeeds.
-    :param first: Observation at the start.
-    :param plans: of (n, 4) actions; each is asked for when those before are carried out.
-    :param num_frames: T at most.
-    """
-    observations, actions = [first], []
-    for plan in plans:
-        plan = divided(plan, table.arm.action_limit)
-        for action in plan[:num_frames - len(observations)]:
-            observations.append(table.step(action))
-            actions.append(action)
-        if len(observations) == num_frames:
-            break
-    done = np.array([*actions, np.zeros(4)], np.float32)
-    return observations, done, 'success' if succeeds(table) else 'failure'
-
-
-def straight(start: np.ndarray, end: np.ndarray, steps: int) -> list[np.ndarray]:
-    """Return the points after start on a straight way of so many steps."""
-    return [start + share * (end - start) for share in np.linspace(0, 1, steps + 1)[1:]]
-
-
-def moves(path: np.ndarray | Sequence[np.ndarray], opened: int = 0,
-          closed: int | None = None) -> np.ndarray:
-    """
-    Return the actions (n, 4) along points (3,) in m.
-
-    :param opened: the fingers are open in so many actions at first.
-    :param closed: they are closed in so many at first, then open; None: in all others.
-    """
-    opening = np.zeros(len(path) - 1)
-    opening[:opened] = 1
-    if closed is not None:
-        opening[closed:] = 1
-    return np.column_stack([np.diff(path, axis=0), opening])
+                            DemonstrationOptions(num_frames, timing, misses))
 
 
 def apart(positions: np.ndarray, separation: float) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
+from tap_ros.base import contract
 from tap_ros.base.errors import SceneError
 
 
@@ -34,8 +35,8 @@ _TABLE = (CAMERA_TILT, CAMERA_FOVY, CAMERA_POSITION)  # all of the table
 _TABLE_AND_ARM = (0.84, 33.5, (0.0, -1.36, 1.33))
 _NEAR = (0.73, 18.5, CAMERA_POSITION)
 GRIP_SPREAD = 0.65  # of the ranges in which objects to be gripped lie: that camera sees less
-LOOKS = {'hand': Look(False, _TABLE), 'arm': Look(True, _TABLE_AND_ARM)}
-DEFAULT_LOOK = 'hand'
+LOOKS = dict(zip(contract.LOOKS, (Look(False, _TABLE), Look(True, _TABLE_AND_ARM)), strict=True))
+DEFAULT_LOOK = contract.DEFAULT_LOOK
 
 
 def get_look(name: str) -> Look:

@@ -58,34 +58,27 @@ class ObjectShape:
     colours: tuple[tuple[float, ...], ...]  # per part: (r, g, b)
 
 
-def random_shape(rng: np.random.Generator) -> ObjectShape:
+def random_shape(rng: np.random.Generator, thin: bool = False) -> ObjectShape:
     """
     Draw a shape and its colours.
 
     :param rng: numpy Generator.
+    :param thin: so that fingers can hold it.
     :return: ObjectShape with its centre of area at the origin.
     """
     kind = SHAPES[rng.choice(len(SHAPES), p=(0.35, 0.35, 0.15, 0.15))]
     colours = tuple(tuple(rng.uniform(0.3, 1.0, 3)) for _ in range(2))
     if kind == 'disc':
-        return ObjectShape(kind, ((rng.uniform(0.04, 0.06), HALF_HEIGHT),), ((0, 0),), colours[:1])
-    return box_shape(
-        kind, HALF_THICKNESS, rng.uniform(0.05, 0.09), rng.uniform(0.02, 0.05), colours)
-
-
-def box_shape(kind: str, thickness: float, length: float, arm_length: float,
-              colours: tuple[tuple[float, ...], ...]) -> ObjectShape:
-    """
-    Make a bar along y, and its arm for an L or a T; all lengths are halves, in metres.
-
-    :return: ObjectShape with its centre of area at the origin.
-    """
-    bar = (thickness, length, HALF_HEIGHT)
+        radius = rng.uniform(0.02, 0.028) if thin else rng.uniform(0.04, 0.06)
+        return ObjectShape(kind, ((radius, HALF_HEIGHT),), ((0, 0),), colours[:1])
+    # A bar along y, and its arm for an L or a T; all lengths are halves.
+    thickness = rng.uniform(0.014, 0.018) if thin else HALF_THICKNESS
+    bar = (thickness, rng.uniform(0.06 if thin else 0.05, 0.09), HALF_HEIGHT)
+    arm = (rng.uniform(0.03 if thin else 0.02, 0.05), thickness, HALF_HEIGHT)
     if kind == 'bar':
         return ObjectShape(kind, (bar,), ((0, 0),), colours[:1])
-    arm = (arm_length, thickness, HALF_HEIGHT)
     # The arm sticks out from the bar's side: at its end for L, its middle for T.
-    arm_centre = np.array([thickness + arm_length, length - thickness if kind == 'L' else 0.0])
+    arm_centre = np.array([thickness + arm[0], bar[1] - thickness if kind == 'L' else 0.0])
     areas = np.array([bar[0] * bar[1], arm[0] * arm[1]])
     centroid = arm_centre * areas[1] / areas.sum()
     return ObjectShape(kind, (bar, arm), (tuple(-centroid), tuple(arm_centre - centroid)), colours)
@@ -112,12 +105,9 @@ def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False) -> mujoco
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    spec.option.iterations = 20
-    spec.option.ls_iterations = 8
-    if gripping:
-        # Soft friction lets what is held creep down: solve for no slip.
-        spec.option.noslip_iterations = 5
-        spec.option.iterations, spec.option.ls_iterations = 50, 20
+    # Soft friction lets what is held creep down: solve for no slip.
+    spec.option.iterations, spec.option.ls_iterations, spec.option.noslip_iterations = (
+        (50, 20, 5) if gripping else (20, 8, 0))
     world = spec.worldbody
     world.add_geom(
         name='table', type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1],
@@ -131,13 +121,14 @@ def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False) -> mujoco
 def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, hand: Hand,
                  surface: dict[str, Any]) -> None:
     """Add the gripper on three slide joints, and two fingers that open along x."""
-    gripper = world.add_body(name='gripper', pos=[0, 0, FINGER_CLEARANCE], gravcomp=1)
+    gripper = world.add_body(
+        name='gripper', pos=[0, 0, FINGER_CLEARANCE], gravcomp=1, mass=0.5, inertia=[1e-3] * 3,
+        explicitinertial=True)
     arm = {'group': ARM_GEOM_GROUP, 'density': 0, **surface}
     gripper.add_geom(
         name='palm', type=mujoco.mjtGeom.mjGEOM_BOX, size=list(hand.palm),
         pos=[0, 0, 2 * hand.finger[2] + hand.palm[2]], rgba=[*hand.palm_colour, 1],
         contype=0, conaffinity=0, **arm)
-    gripper.mass, gripper.inertia, gripper.explicitinertial = 0.5, [1e-3, 1e-3, 1e-3], True
     # Weak downwards: fingers that come down on an object rest on it and do not shoot it away.
     for name, axis, limit in zip(GRIPPER_JOINTS[:3], np.eye(3), (30, 30, 8)):
         gripper.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=list(axis))
@@ -145,8 +136,7 @@ def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, hand: Hand,
     for side, sign in (('left', -1), ('right', 1)):
         finger = gripper.add_body(
             name=f'{side}_finger', pos=[sign * (hand.finger[0] + FINGER_GAP), 0, hand.finger[2]],
-            gravcomp=1)
-        finger.mass, finger.inertia, finger.explicitinertial = 0.05, [1e-4, 1e-4, 1e-4], True
+            gravcomp=1, mass=0.05, inertia=[1e-4] * 3, explicitinertial=True)
         # Fingers touch objects (bit 1), neither each other nor the table.
         finger.add_geom(
             name=f'{side}_finger', type=mujoco.mjtGeom.mjGEOM_BOX, size=list(hand.finger),
@@ -159,13 +149,9 @@ def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, hand: Hand,
 def _add_servo(spec: mujoco.MjSpec, joint: str, kp: float, kv: float, limit: float) -> None:
     """Add a position servo on a joint: force = kp (target - position) - kv velocity."""
     actuator = spec.add_actuator(
-        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        biastype=mujoco.mjtBias.mjBIAS_AFFINE)
-    actuator.gainprm[0] = kp
-    actuator.biasprm[1] = -kp
-    actuator.biasprm[2] = -kv
-    actuator.forcelimited = True
-    actuator.forcerange = [-limit, limit]
+        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, forcelimited=True,
+        forcerange=[-limit, limit])
+    actuator.set_to_position(kp=kp, kv=kv)
 
 
 def _add_object(world: mujoco.MjsBody, name: str, shape: ObjectShape) -> None:

@@ -12,11 +12,12 @@ the robot is. That takes a tenth of the time of shadow maps.
 """
 
 import contextlib
+from dataclasses import replace
 from functools import lru_cache
 
 import mujoco
 import numpy as np
-from sim_bridge.world.camera import Camera, OpenGL
+from sim_bridge.world.camera import Camera, Renderer
 from sim_bridge.world.looks import Appearance, USUAL
 from sim_bridge.world.scene import ARM_GEOM_GROUP
 from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
@@ -24,7 +25,7 @@ from tap_ros.base.errors import SceneError
 from tap_ros.robots.arm import Arm
 
 SAMPLES = 2  # along each side of a pixel
-MAX_GEOMS = 400
+MOST_GEOMS = 400  # with shadows
 TABLE_HALF = 0.57  # m, of the table's square top
 RIM = (0.015, 0.02)  # m: half its width, its height
 FLOOR = -0.75  # m
@@ -49,13 +50,9 @@ class Studio:
         width, height = samples * camera.width, samples * camera.height
         self._joints = np.zeros(len(arm.joints))
         self._model = _studio_model(arm if links else None)
-        self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         self._table_colour = self._model.mat('table').rgba.copy()
         self._data = mujoco.MjData(self._model)
-        self._gl = OpenGL(self._model, width, height)
-        self._scene = mujoco.MjvScene(self._model, MAX_GEOMS)
-        self._eye = mujoco.MjvCamera()
-        self._eye.type, self._eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        self._renderer = Renderer(self._model, width, height, MOST_GEOMS)
         self._show, self._hide = mujoco.MjvOption(), mujoco.MjvOption()
         self._hide.geomgroup[ARM_GEOM_GROUP] = 0
         self._perturbation = mujoco.MjvPerturb()
@@ -66,7 +63,9 @@ class Studio:
         # What the mask says of each geom of the physics model.
         hand = physics.geom_group == ARM_GEOM_GROUP
         self._labels = np.where(hand, ROBOT_MASK_HAND, ROBOT_MASK_FREE).astype(np.uint8)
-        camera = self._camera.moved(appearance.camera_offset, appearance.camera_tilt)
+        usual = self._camera
+        camera = replace(usual, tilt=usual.tilt + appearance.camera_tilt, position=tuple(
+            np.add(usual.position, appearance.camera_offset).tolist()))
         model = self._model
         model.cam('camera').pos[:] = camera.position
         model.cam('camera').quat[:] = camera.quaternion
@@ -94,28 +93,31 @@ class Studio:
             (J,) rad of the arm.
         """
         self._pose_arm(data.qpos[:3])
-        scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL
-        option = self._hide if hide_arm else self._show
-        mujoco.mjv_updateScene(
-            self._model, self._data, option, None, self._eye, everything, scene)
+        option, scene = self._hide if hide_arm else self._show, self._renderer.scene
+        self._renderer.update_scene(self._data, 'camera', option)
         own = scene.ngeom
         mujoco.mjv_addGeoms(self._physics, data, option, self._perturbation,
                             mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
-        colours = self._gl.draw(scene)
+        colours = self._renderer.render()
         labels = self._add_shadows(own)
-        numbers = self._gl.draw(scene, numbers=True)
+        numbers = self._renderer.numbers()[..., 0]
         # Shadows darken the table; light falls off at their edges as pixels are averaged.
         label, shadow = labels[numbers, 0], labels[numbers, 1]
         shade = np.where((shadow != 0) & self._table, 1 - SHADOW, 1).astype(np.float32)
         shaded = colours * shade[..., None]
-        picture = sum(_samples(shaded, self._samples)) / self._samples ** 2
+        picture = sum(self._parts(shaded)) / self._samples ** 2
         # Of a pixel the robot's if one of its samples is.
-        mask = np.maximum.reduce(_samples(label, self._samples))
+        mask = np.maximum.reduce(self._parts(label))
         return np.rint(picture).astype(np.uint8), mask, self._joints.copy()
+
+    def _parts(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return the first sample of each pixel (H, W, ...), the second, and so on."""
+        side = self._samples
+        return [values[row::side, column::side] for row in range(side) for column in range(side)]
 
     def close(self) -> None:
         """Free the OpenGL context."""
-        self._gl.close()
+        self._renderer.close()
 
     def _pose_arm(self, gripper: np.ndarray) -> None:
         """Let the arm carry the gripper at (3,) m."""
@@ -135,21 +137,22 @@ class Studio:
         :return: uint8 (N + 1, 2): for each geom of the scene the mask's label and whether it is a
             shadow; the last row is for pixels without a geom.
         """
-        scene, count = self._scene, self._scene.ngeom
+        scene = self._renderer.scene
+        count = scene.ngeom
         labels = np.zeros((2 * count + 1, 2), np.uint8)
         for i in range(count):
             geom = scene.geoms[i]
-            geom.segid = i
-            if i < own and self._model.geom_group[geom.objid] != ARM_GEOM_GROUP:
+            number, geom.segid, geom.objid = geom.objid, i, i
+            if i < own and self._model.geom_group[number] != ARM_GEOM_GROUP:
                 continue  # furniture
-            label = ROBOT_MASK_ARM if i < own else self._labels[geom.objid]
+            label = ROBOT_MASK_ARM if i < own else self._labels[number]
             shadow = scene.geoms[scene.ngeom]
             place = self._flatten @ geom.pos
             place[2] += SHADOW_HEIGHT
             mujoco.mjv_initGeom(shadow, geom.type, geom.size, place,
                                 (self._flatten @ geom.mat).ravel(), geom.rgba)
             shadow.size[:] = geom.size  # mjv_initGeom makes cylinders and capsules as long as wide
-            shadow.segid = scene.ngeom
+            shadow.segid = shadow.objid = scene.ngeom
             labels[i] = label, 0
             labels[scene.ngeom] = label, 1
             scene.ngeom += 1
@@ -159,7 +162,6 @@ class Studio:
 def _studio_model(arm: Arm | None) -> mujoco.MjModel:
     """Compile table, rim, floor, light, camera and perhaps the arm."""
     spec = mujoco.MjSpec()
-    spec.visual.quality.shadowsize = spec.visual.quality.offsamples = 0
     spec.visual.quality.numslices, spec.visual.quality.numstacks = 16, 8
     spec.visual.quality.numquads = 1
     spec.visual.map.znear, spec.visual.map.zfar = 0.1, 10
@@ -168,9 +170,9 @@ def _studio_model(arm: Arm | None) -> mujoco.MjModel:
     spec.visual.headlight.specular = [0, 0, 0]
     world = spec.worldbody
     world.add_camera(name='camera')
-    light = world.add_light(
-        name='light', pos=[0, 0, 3], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    light.castshadow, light.ambient, light.specular = False, [0, 0, 0], [0.12, 0.12, 0.12]
+    world.add_light(
+        name='light', pos=[0, 0, 3], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=False, ambient=[0, 0, 0], specular=[0.12, 0.12, 0.12])
     spec.add_texture(
         name='walls', type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=16, height=96,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=[0.78, 0.79, 0.8],
@@ -193,8 +195,8 @@ def _add_arm(spec: mujoco.MjSpec, arm: Arm) -> None:
     bodies = [body]
     for joint, link, (place, roll) in zip(arm.joints, arm.links[1:], arm.origins):
         body = body.add_body(
-            name=link, pos=place, quat=[np.cos(roll / 2), np.sin(roll / 2), 0, 0])
-        body.mass, body.inertia, body.explicitinertial = 1.0, [0.01] * 3, True
+            name=link, pos=place, quat=[np.cos(roll / 2), np.sin(roll / 2), 0, 0], mass=1.0,
+            inertia=[0.01] * 3, explicitinertial=True)
         body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
         bodies.append(body)
     for shape in arm.shapes:
@@ -212,9 +214,9 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
         name='wood', type=mujoco.mjtTexture.mjTEXTURE_2D, width=wood.shape[1],
         height=wood.shape[0], nchannel=3)
     texture.data = wood.tobytes()
-    material = spec.add_material(name='table', texrepeat=[1, 1], specular=0.1, shininess=0.2)
     # Half bright: factors of an Appearance above 1 have room.
-    material.rgba = [0.62, 0.62, 0.62, 1]
+    material = spec.add_material(name='table', texrepeat=[1, 1], specular=0.1, shininess=0.2,
+                                 rgba=[0.62, 0.62, 0.62, 1])
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = 'wood'
     world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[TABLE_HALF, TABLE_HALF, 0.1],
                    material='table')
@@ -255,13 +257,6 @@ def _wood(size: int = 256, planks: int = 7) -> np.ndarray:
 @lru_cache(4)
 def _sees_table(camera: Camera, samples: int) -> np.ndarray:
     """Say which samples of a picture look at the table's top: bool (H, W), of all samples."""
-    fine = camera.resized(samples * camera.width, samples * camera.height)
-    u, v = np.meshgrid(np.arange(fine.width), np.arange(fine.height))
-    place = fine.on_table(np.stack([u, v], -1))
-    return (np.abs(place) < TABLE_HALF).all(-1)
-
-
-def _samples(values: np.ndarray, samples: int) -> list[np.ndarray]:
-    """Return the first sample of each pixel (H, W, ...), the second, and so on."""
-    return [values[row::samples, column::samples]
-            for row in range(samples) for column in range(samples)]
+    fine = replace(camera, width=samples * camera.width, height=samples * camera.height)
+    pixels = np.stack(np.meshgrid(np.arange(fine.width), np.arange(fine.height)), -1)
+    return (np.abs(fine.on_table(pixels)) < TABLE_HALF).all(-1)

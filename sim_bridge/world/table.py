@@ -5,6 +5,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
+from dataclasses import replace
 
 import mujoco
 import mujoco.rollout
@@ -39,13 +40,6 @@ OBSERVER_SIZE = 384  # pixels of the picture for people
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
 
 
-def divided(actions: np.ndarray, limit: Sequence[float]) -> np.ndarray:
-    """Return actions (n, 4) with every one whose move exceeds (3,) m in several equal parts."""
-    parts = np.ceil((np.abs(actions[:, :3]) / limit).max(1, initial=0) - 1e-6).astype(int)
-    parts = np.maximum(parts, 1)
-    return np.repeat(actions / np.stack([parts, parts, parts, np.ones_like(parts)], 1), parts, 0)
-
-
 def ramp_controls(target: np.ndarray, actions: np.ndarray,
                   low: Sequence[float] = WORKSPACE_LOW, high: Sequence[float] = WORKSPACE_HIGH,
                   ) -> tuple[np.ndarray, np.ndarray]:
@@ -72,21 +66,25 @@ def ramp_controls(target: np.ndarray, actions: np.ndarray,
     return controls.reshape(*actions.shape[:-2], -1, 5), targets
 
 
+def objects_in(states: np.ndarray, model: mujoco.MjModel) -> np.ndarray:
+    """Return (..., K, 7) x, y, z in m, quaternion w, x, y, z in states (..., S) of the physics."""
+    poses = states[..., 1 + OBJECT_QPOS_START:1 + model.nq]  # after the time
+    return poses.reshape(*poses.shape[:-1], -1, 7)
+
+
+def upright(objects: np.ndarray) -> np.ndarray:
+    """Return the cosines (...) of tilts; objects (..., 7) as objects_in."""
+    return 1 - 2 * (objects[..., 4] ** 2 + objects[..., 5] ** 2)
+
+
 class Table(OneCamera):
     """
-    A table with a gripper, objects and a camera.
+    A table with a gripper, objects and a camera; see simulator.Simulator.
 
-    :param image_size: pixels of the square picture.
     :param gripping: the hand is one that grips, and the camera near.
-    :param look: name of a look, see looks.LOOKS.
-    :param appearance: name of an appearance, see appearance.CHOICES.
-    :param arm: name of an arm, see robots.arm.get_arm.
     :ivar goal_poses: (K, 7) where the objects shall be, as object_poses.
     :ivar object_names: K names, in the order of their poses.
     :ivar seed: of the scene.
-    :raises ConfigError: for an unknown arm.
-    :raises SceneError: for an unknown look or appearance, a bad size, or when nothing can be
-        rendered.
     """
 
     goal_poses: np.ndarray
@@ -214,7 +212,7 @@ class Table(OneCamera):
     def observer_picture(self) -> np.ndarray:
         """Take the camera's picture with the whole arm, for people: uint8 (384, 384, 3) rgb."""
         if self._observer is None:
-            camera = self._usual_camera.resized(OBSERVER_SIZE, OBSERVER_SIZE)
+            camera = replace(self._usual_camera, width=OBSERVER_SIZE, height=OBSERVER_SIZE)
             self._observer = Studio(camera, self.arm, links=True, samples=1)
         self._observer.use(self.model, self._worn)
         return self._observer.render(self.data)[0]
@@ -270,9 +268,6 @@ class Table(OneCamera):
 
 def lifted(planar_poses: np.ndarray, height: float | np.ndarray = 0.0) -> np.ndarray:
     """Turn (K, 3) x, y, yaw into (K, 7) poses at a height, or (K,), above the table in metres."""
-    poses = np.zeros((len(planar_poses), 7))
-    poses[:, :2] = planar_poses[:, :2]
-    poses[:, 2] = HALF_HEIGHT + height
-    poses[:, 5] = np.sin(planar_poses[:, 2] / 2)
-    poses[:, 6] = np.cos(planar_poses[:, 2] / 2)
-    return poses
+    level, half = np.zeros(len(planar_poses)), planar_poses[:, 2] / 2
+    return np.column_stack([planar_poses[:, :2], level + (HALF_HEIGHT + height), level, level,
+                            np.sin(half), np.cos(half)])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from tap_ros.apps.predict_command import labelled, read_picture, read_pixels
+from tap_ros.apps.predict_command import labelled, read_inputs
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
@@ -60,14 +60,9 @@ def run(args: Options) -> None:
     """
     if Path(args.out).suffix.lower() != '.png':
         raise ConfigError(f'--out {escaped(args.out)}: expected a .png file')
-    pictures, pixels = {}, {}
-    for name, file, positions, option in (
-            ('start', args.start, args.objects, '--objects'),
-            ('goal', args.goal, args.goal_objects, '--goal-objects')):
-        if positions and not file:
-            raise ConfigError(f'{option}: name the picture that they are in, --{name} FILE')
-        if file:
-            pictures[name], pixels[name] = read_picture(file), read_pixels(positions, option)
+    pictures, pixels = read_inputs(
+        {'start': args.start, 'goal': args.goal},
+        {'--objects': args.objects, '--goal-objects': args.goal_objects})
     with Client(args.namespace, args.timeout) as client:
         response = client.call('predict', **request_fields(
             **pictures, **{f'{name}_objects': places for name, places in pixels.items()}),

@@ -27,7 +27,7 @@ from tyro import conf
 # Of a command: the name of its module, MODULE:FUNCTION where that is of several commands, or
 # {word: (one line of help, the same)}.
 Module: TypeAlias = 'str | dict[str, tuple[str, Module]]'
-Run: TypeAlias = Callable[[Any], int | None]
+Run: TypeAlias = Callable[[Any], Any]  # what it returns is the exit code, if it is an int
 
 COMMANDS: dict[str, tuple[str, Module]] = {
     'collect': ('simulate the expert and record it', 'sim_bridge.collect'),
@@ -45,11 +45,9 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'predictor': ('train a subgoal predictor', 'tap_ros.apps.train:predictor'),
         'forward': ("train the planner's forward model", 'tap_ros.apps.train:forward'),
     }),
-    'evaluate': ('score trained weights or a tracker', {
-        'prediction': ('score a predictor on recordings', 'tap_ros.apps.evaluate:prediction'),
-        'forward': ('score a forward model on recordings', 'tap_ros.apps.evaluate:forward'),
-        'tracking': ('score what follows objects on recordings or films',
-                     'tap_ros.apps.evaluate:tracking'),
+    'evaluate': ('score trained weights', {
+        'prediction': ('score a predictor on recordings', 'tap_ros.apps.evaluate_prediction'),
+        'forward': ('score a forward model on recordings', 'tap_ros.apps.evaluate_forward'),
     }),
     'predict': ('predict subgoals from picture files', 'tap_ros.apps.predict_command'),
     'call': ('ask a running predictor node', 'tap_ros.apps.call_command'),
@@ -96,27 +94,26 @@ def main(arguments: Sequence[str] | None = None, line: CommandLine = TAP_ROS) ->
         run, options = read(arguments, line)
         if signal.getsignal(signal.SIGINT) is leave_at_once:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-        return run(options) or 0
+        code = run(options)
+        return code if isinstance(code, int) else 0
     except TapError as error:
-        print(f'error: {escaped(error, 2000)}', file=sys.stderr)
-        return 1
+        message = escaped(error, 2000)
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
-        print(f'error: {error.name} is not installed; type `pip install '
-              f'{EXTRAS[error.name]}`', file=sys.stderr)
-        return 1
+        message = f'{error.name} is not installed; type `pip install {EXTRAS[error.name]}`'
     except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
         return 1
     except OSError as error:
         place = f'{escaped(error.filename)}: ' if error.filename else ''
-        print(f'error: {place}{escaped(error.strerror or error)}; see whether the place is there, '
-              'yours and not full', file=sys.stderr)
-        return 1
+        message = (f'{place}{escaped(error.strerror or error)}; see whether the place is there, '
+                   'yours and not full')
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
+    print(f'error: {message}', file=sys.stderr)
+    return 1
 
 
 def read(arguments: Sequence[str], line: CommandLine = TAP_ROS) -> tuple[Run, Any]:
@@ -130,43 +127,40 @@ def read(arguments: Sequence[str], line: CommandLine = TAP_ROS) -> tuple[Run, An
     words = list(arguments)
     completion = bool(words) and words[0].startswith('--tyro-')
     runs: dict[Any, Run] = {}
-    kinds = [_command(name, *about, None if completion else words, runs)
-             for name, about in line.commands.items()]
     # What is completed is a name that a shell can look up, not three words.
-    options = parse(reduce(or_, kinds), words, line.prog.split()[-1] if completion else line.prog,
-                    line.summary)
-    again = getattr(sys.modules[runs[type(options)].__module__], 'defaults', None)
+    options = parse(_union(line.commands, None if completion else words, runs), words,
+                    line.prog.split()[-1] if completion else line.prog, line.summary)
+    run = runs[type(options)]
+    again = getattr(sys.modules[run.__module__], 'defaults', None)
     if again:  # what is left out depends on what was said
         options = parse(type(options), words[2:], f'{line.prog} {words[0]} {words[1]}',
                         default=again(options))
-    return runs[type(options)], options
+    return run, options
 
 
-def _command(name: str, summary: str, module: Module, words: list[str] | None,
-             runs: dict[Any, Run]) -> Any:
+def _union(commands: Mapping[str, tuple[str, Module]], words: Sequence[str] | None,
+           runs: dict[Any, Run]) -> Any:
     """
-    Return the type of a command's options, a union where it has a second word.
+    Return the type of the options of commands, a union.
 
-    :param module: of COMMANDS.
-    :param words: from the name on, if it is this command that is asked for; None: all are.
+    :param words: what is said, of which the first one is a command; None: anything may be.
     :param runs: gets the function for the options.
     """
-    asked = words is None or bool(words) and words[0].replace('_', '-') == name
-    if isinstance(module, dict):
-        rest = words and words[1:] if asked else []
-        kinds = [_command(word, *about, rest, runs) for word, about in module.items()]
-        kind = reduce(or_, kinds)
-    elif not asked:
-        kind = Unread
-    else:
-        kind = _load(module, runs, needed=words is not None)
-    return Annotated[kind, conf.subcommand(name, description=summary)]
+    kinds = []
+    for name, (summary, module) in commands.items():
+        asked = words is None or words[:1] in ([name], [name.replace('-', '_')])
+        if isinstance(module, dict):
+            kind = _union(module, words and words[1:] if asked else [], runs)
+        else:
+            kind = _load(module, runs, needed=words is not None) if asked else Unread
+        kinds.append(Annotated[kind, conf.subcommand(name, description=summary)])
+    return reduce(or_, kinds)
 
 
 def _load(name: str, runs: dict[Any, Run], needed: bool = True) -> Any:
     """Import a module of COMMANDS; return the type of its options: Options, or as FUNCTION."""
+    place, _, word = name.partition(':')
     try:
-        place, _, word = name.partition(':')
         module = importlib.import_module(place)
     except ImportError:
         if needed:

@@ -3,6 +3,7 @@
 """Show what a recording or a weights file holds."""
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 import json
 from pathlib import Path
@@ -15,11 +16,10 @@ from tap_ros.base.options import File
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import film_strip, grid, png_bytes
-from tap_ros.recording.bags import check_first_picture, find_bags, list_topics
-from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.bags import find_bags, list_topics
+from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.reading import Reading, reading_of, ReadingOptions
-from tap_ros.recording.topic_choice import find_topics
+from tap_ros.recording.reading import reading_of, ReadingOptions
 from tap_ros.training.split import split_episodes, warn_if_few
 from tyro import conf
 
@@ -53,34 +53,31 @@ def run(args: Options) -> None:
         _, about = load_tensors(args.path)
         print(json.dumps(about, indent=2))
         return
-    found = list_topics(args.path)
-    for number, (topic, kind, count) in enumerate(found):
+    bags = find_bags(args.path)
+    for number, (topic, kind, count) in enumerate(list_topics(bags)):
         print(f'{"" if number else "topics":<11} {escaped(topic)}  {escaped(kind)}  '
               + ('unknown' if count is None else f'{count} messages'))
     reading = reading_of(args.reading)
-    check_first_picture([args.path], reading, 'the predictor')
-    cameras = {next(iter(find_topics(bag, camera))) for bag in find_bags(args.path)
-               for camera in reading.cameras}
-    store = open_recordings([args.path], reading=reading)
+    store = open_recordings(bags, reading=reading, network='the predictor')
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
-    objects = sorted({len(e.object_names) for e in episodes})
     print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     if store.camera_size not in (store.image_size, None):
         print('cut         from pictures of {1}x{0} pixels'.format(*store.camera_size))
-    print(f'told apart  {_told_apart(store, reading)}')
-    print(f'camera      {listing(sorted(cameras))}')
-    print(f'length      {lengths.min()} to {lengths.max()} frames, median {np.median(lengths):g}')
-    print(f'objects     {", ".join(map(str, objects))}')
+    apart = 'by marks' if store.marked else (
+        f'no marks: by pauses of more than {reading.gap:g} s (--gap); a bag alone without any is '
+        f'cut into parts of at most {reading.episode_seconds:g} s (--episode-seconds)')
     masked = sum(e.robot_masks is not None for e in episodes)
-    print(f'robot masks {masked} of {len(episodes)} episodes')
-    for name, values in (('task', [e.task for e in episodes]),
-                         ('outcome', [e.outcome for e in episodes])):
-        counts = Counter(values).most_common()
-        counts = listing(f'{escaped(k, 40) or "unknown"} {v}' for k, v in counts)
-        print(f'{name:<11} {counts}')
-    print(f'data hash   {store.data_hash}')
+    for name, value in (
+            ('told apart', apart), ('camera', listing(store.cameras)),
+            ('length', f'{lengths.min()} to {lengths.max()} frames, median '
+                       f'{np.median(lengths):g}'),
+            ('objects', listing(sorted({len(e.object_names) for e in episodes}))),
+            ('robot masks', f'{masked} of {len(episodes)} episodes'),
+            ('task', _counted(e.task for e in episodes)),
+            ('outcome', _counted(e.outcome for e in episodes)), ('data hash', store.data_hash)):
+        print(f'{name:<11} {value}')
     if args.picture:
         strips = [film_strip(_tinted(e) if args.robot_mask else e.frames)
                   for e in episodes[:args.episodes]]
@@ -92,12 +89,9 @@ def run(args: Options) -> None:
     warn_if_few(held_out)
 
 
-def _told_apart(store: EpisodeStore, reading: Reading) -> str:
-    """Say how episodes are told apart."""
-    if store.marked:
-        return 'by marks'
-    return (f'no marks: by pauses of more than {reading.gap:g} s (--gap); a bag alone without '
-            f'any is cut into parts of at most {reading.episode_seconds:g} s (--episode-seconds)')
+def _counted(values: Iterable[str]) -> str:
+    return listing(f'{escaped(value, 40) or "unknown"} {count}'
+                   for value, count in Counter(values).most_common())
 
 
 def _tinted(episode: Episode) -> np.ndarray:

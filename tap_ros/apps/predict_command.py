@@ -2,19 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros predict`: subgoals from picture files, as a labelled picture."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-import io
 from pathlib import Path
 import sys
 from typing import Annotated, TYPE_CHECKING
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from tap_ros.base.errors import ConfigError, ImageError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
 from tap_ros.base.text import escaped
 from tap_ros.images.crop import Crop
+from tap_ros.images.drawing import grid, OBJECT_COLOURS, overlay, png_bytes
 from tap_ros.images.encodings import decompress
 from tap_ros.images.pixels import in_picture, resize_image, resize_pixels
 from tap_ros.recording.reading import Part
@@ -24,8 +25,7 @@ from tyro import conf
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
 
-PANEL = 2.6  # inches, side of a picture
-DPI = 100
+PANEL, HEAD = 260, 26  # px, side of a picture, and above it for its title
 _LARGEST = 2 ** 29  # bytes of rgb, of a picture file; phones make larger ones than cameras stream
 FAINT = 0.5  # mass of a map, below which an object is hardly in the prediction
 
@@ -79,13 +79,9 @@ def run(args: Options) -> None:
         raise ConfigError(f'--out {escaped(args.out)}: is a picture to predict from; give another')
     predictor = load_predictor(args.weights)
     size = predictor.image_size
-    pictures = {'start': read_picture(args.start)}
-    if args.goal:
-        pictures['goal'] = read_picture(args.goal)
-    pixels = {'start': read_pixels(args.objects, '--objects'),
-              'goal': read_pixels(args.goal_objects, '--goal-objects')}
-    if not args.goal and len(pixels['goal']):
-        raise ConfigError('--goal-objects: there is no goal picture; name it behind the start')
+    pictures, pixels = read_inputs(
+        {'start': args.start or '.', 'goal': args.goal},  # an empty name is refused as a folder
+        {'--objects': args.objects, '--goal-objects': args.goal_objects})
     if args.goal and len(pixels['start']) != len(pixels['goal']):
         raise ConfigError(
             f'--objects and --goal-objects: {len(pixels["start"])} and {len(pixels["goal"])} '
@@ -111,18 +107,29 @@ def run(args: Options) -> None:
     print(f'written: {escaped(args.out)}')
 
 
-def read_picture(path: str | Path) -> np.ndarray:
+def read_inputs(files: Mapping[str, str], positions: Mapping[str, Sequence[str]],
+                ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """
-    Read a picture file just as a compressed picture of a recording or a camera is read.
+    Read picture files, just as a compressed picture of a camera is read, and positions in them.
 
-    :param path: of a JPEG, PNG or WebP file.
-    :return: uint8 (H, W, 3) rgb.
-    :raises ImageError: when it is no picture, or is damaged; OSError: when it is not there.
+    :param files: of 'start' and 'goal', JPEG, PNG or WebP; '' where there is none.
+    :param positions: by their options the positions in these, see read_pixels.
+    :return: of those that are there uint8 (H, W, 3) rgb, and float32 (K, 2), (u, v).
+    :raises ImageError: for a file that is no picture, or is damaged.
+    :raises ConfigError: for positions that are none, or without a picture.
     """
-    try:
-        return decompress(Path(path).read_bytes(), Path(path).suffix[1:], _LARGEST)
-    except ImageError as error:
-        raise ImageError(f'{escaped(path)}: {error}') from error
+    pictures, pixels = {}, {}
+    for (name, file), (option, words) in zip(files.items(), positions.items(), strict=True):
+        if words and not file:
+            raise ConfigError(f'{option}: name the {name} picture that they are in, too')
+        if file:
+            pixels[name] = read_pixels(words, option)
+            try:
+                pictures[name] = decompress(
+                    Path(file).read_bytes(), Path(file).suffix[1:], _LARGEST)
+            except ImageError as error:
+                raise ImageError(f'{escaped(file)}: {error}') from error
+    return pictures, pixels
 
 
 def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
@@ -183,32 +190,35 @@ def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
     :param subgoals: list of Subgoal; a row for each, its maps beside it where there are objects.
     :return: bytes of a PNG file.
     """
-    from matplotlib.figure import Figure
-    from tap_ros.images.drawing import OBJECT_COLOURS, overlay
-    count = len(pixels['start'])
-    columns = len(pictures) + 1 + bool(count)
-    figure = Figure(figsize=(PANEL * columns, (PANEL + 0.3) * len(subgoals)), dpi=DPI,
-                    layout='constrained')
-    axes = figure.subplots(len(subgoals), columns, squeeze=False)
-    for row, subgoal in zip(axes, subgoals):
+    rows = []
+    for subgoal in subgoals:
         panels = [(name, picture, pixels[name]) for name, picture in pictures.items()]
         panels.append((_title(subgoal, len(subgoals)), subgoal.image, pixels['start'][:0]))
-        if count:
+        if len(pixels['start']):
             panels.append(('where the objects are then', overlay(
                 subgoal.image, subgoal.object_maps), subgoal.expected_pixels))
-        for panel, (title, picture, marks) in zip(row, panels):
-            panel.imshow(picture, interpolation='nearest')
-            panel.set_title(title, fontsize=10)
-            panel.set_axis_off()
-            for k, (u, v) in enumerate(marks):
-                colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)]) / 255
-                panel.annotate(
-                    str(k + 1), (u, v), xytext=(8, 8), textcoords='offset points', color='white',
-                    fontsize=9, arrowprops={'arrowstyle': '-', 'color': colour},
-                    bbox={'boxstyle': 'circle,pad=0.15', 'facecolor': colour, 'linewidth': 0})
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='png')
-    return buffer.getvalue()
+        rows.append([_panel(*panel) for panel in panels])
+    return png_bytes(grid(rows))
+
+
+def _panel(title: str, picture: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """Draw a picture below its title, and a number beside each pixel (K, 2)."""
+    height, width = picture.shape[:2]
+    scale = PANEL / max(height, width)
+    image = Image.new('RGB', (PANEL, HEAD + PANEL), 'white')
+    image.paste(Image.fromarray(picture).resize(
+        (round(scale * width), round(scale * height)),
+        Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX), (0, HEAD))
+    draw = ImageDraw.Draw(image)
+    draw.text((2, HEAD // 2), title, 'black', ImageFont.load_default(16), anchor='lm')
+    for k, (u, v) in enumerate((np.asarray(marks) + 0.5) * scale):
+        if np.isfinite((u, v)).all():
+            u, v = u + 12, v + HEAD - 12
+            colour = OBJECT_COLOURS[k % len(OBJECT_COLOURS)]
+            draw.line((u - 12, v + 12, u, v), colour, 2)
+            draw.ellipse((u - 9, v - 9, u + 9, v + 9), colour, 'white')
+            draw.text((u, v), str(k + 1), 'white', ImageFont.load_default(14), anchor='mm')
+    return np.array(image)
 
 
 def _title(subgoal: 'Subgoal', count: int) -> str:

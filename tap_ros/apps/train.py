@@ -5,11 +5,11 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
 
 from tap_ros.base.errors import ConfigError, TapError
+from tap_ros.base.text import meant
 from tap_ros.recording.reading import reading_of
 from tap_ros.training import forward_config as forward_training_config
 from tap_ros.training import predictor_config as training_config
@@ -51,9 +51,8 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
     known = [field.name for field in fields(usual)]
     for name in settings:
         if name not in known:
-            near = get_close_matches(name, known, 1)
-            raise ConfigError(f'setting {name!r} of a {model} is unknown'
-                              + (f'; did you mean {near[0]!r}?' if near else ''))
+            raise ConfigError(f'setting {name!r} of a {model} is unknown; '
+                              f'{meant(name, known)}see training/{model}_config.py')
     settings |= {'recordings': recordings, **({'out': out} if out else {})}
     for name, value in settings.items():
         if name in ('recordings', 'held_out', 'image_topic'):
@@ -79,9 +78,8 @@ def defaults(asked: Config) -> Any:
     sized = replace(asked, size=asked.size or shape.get('size', 0))
     name = asked.recipe or _recipe_of(sized, recipes)
     if name not in recipes:
-        near = get_close_matches(name, recipes, 1)
-        meant = f'did you mean {near[0]!r}? ' if near else ''
-        raise ConfigError(f'recipe {name!r} is unknown; {meant}valid: {", ".join(recipes)}')
+        raise ConfigError(f'recipe {name!r} is unknown; {meant(name, recipes)}valid: '
+                          f'{", ".join(recipes)}')
     marked = {'selection': 'marks'} if getattr(asked, 'marks', '') else {}
     return replace(recipes[name], recipe=name, **shape, **marked)
 
@@ -101,12 +99,9 @@ def _shape(asked: Config) -> dict[str, Any]:
 def _recipe_of(asked: Config, recipes: dict[str, Any]) -> str:
     """Name the recipe for recordings: that of the task of their first episode, if there is one."""
     with suppress(TapError):  # what cannot be read, the run says
-        from tap_ros.recording.bags import check_first_picture
         from tap_ros.recording.cache import open_recordings  # --help does without numpy
-        reading = reading_of(asked)
-        check_first_picture(asked.recordings, reading, 'the network')
         task = asked.recordings and open_recordings(
-            list(asked.recordings), reading=reading)[0].task
+            asked.recordings, reading=reading_of(asked), network='the network')[0].task
         if task in recipes:
             return task
     return 'foreign' if getattr(asked, 'marks', '') else next(iter(recipes))

@@ -24,6 +24,10 @@ LIFTED = 0.13  # at which the arm travels
 SUCCESS_DISTANCE = 0.05  # m; an episode succeeds when every object ends nearer to its goal
 GOAL_TOLERANCE = 1.0  # px; the planner takes a goal or subgoal for reached within this distance
 
+TABLE = 'mujoco_table'  # the world of the simulator of this package
+LOOKS = ('hand', 'arm')  # what its pictures show of the robot: the hand alone, or all of it
+DEFAULT_LOOK = 'hand'
+
 WORLD_FRAME = 'world'  # frame of positions and commands
 CAMERA_FRAME = 'camera_optical_frame'  # of pictures: z looks ahead, x right, y down (REP 103)
 
@@ -40,6 +44,7 @@ ROBOT_MASK_FREE = 0  # neither robot nor shadow
 ROBOT_MASK_HAND = 128  # the hand (gripper) or its shadow
 ROBOT_MASK_ARM = 255  # the arm or its shadow
 ROBOT_MASKS = ('none', 'arm', 'all')  # what is taken for hidden: nothing, arm, arm and hand
+MODES = ('bidirectional', 'forward')  # of predictors: between start and goal, or after the start
 
 # Module and class of each node, by the name of the node and of its executable.
 NODE_CLASSES = {

@@ -133,13 +133,18 @@ def _pool(engine: Engine) -> Iterator[Workers]:
 
     def begin(task: Work) -> 'Future[Any]':
         nonlocal pool
-        with deaf_children():
-            try:
-                return pool.submit(task.function, *task.args)
-            except BrokenProcessPool:
-                pool.shutdown(cancel_futures=True)
-                pool = start()
-                return pool.submit(task.function, *task.args)
+        # A terminal sends Ctrl-C to processes that begin here, too: they ignore it.
+        alone = threading.current_thread() is threading.main_thread()
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN) if alone else None
+        try:
+            return pool.submit(task.function, *task.args)
+        except BrokenProcessPool:
+            pool.shutdown(cancel_futures=True)
+            pool = start()
+            return pool.submit(task.function, *task.args)
+        finally:
+            if alone:
+                signal.signal(signal.SIGINT, before)
 
     try:
         yield begin, room, (BrokenProcessPool,)
@@ -149,19 +154,6 @@ def _pool(engine: Engine) -> Iterator[Workers]:
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def deaf_children() -> Iterator[None]:
-    """Let processes that begin in the block ignore Ctrl-C, which a terminal sends to them, too."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _start_worker() -> None:

@@ -44,7 +44,12 @@ def write_atomically(path: str | Path, data: bytes | bytearray | memoryview | st
             except BaseException:
                 part.unlink(missing_ok=True)
                 raise
-        _sync_folder(path.parent)
+        with suppress(OSError):  # the name of a new file, too, where the file system can
+            handle = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
 
 
 def write_rows(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -88,17 +93,9 @@ def only_writer(folder: str | Path) -> Iterator[None]:
     :param folder: made if it is not there.
     :raises StorageError: when another process is writing there, or the folder cannot be made.
     """
-    with storage_errors(folder):
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        if not _lock(handle, wait=False):
-            raise StorageError(
-                f'{escaped(folder)}: another process is writing there; wait until it has ended, '
-                'or choose another folder')
+    with _locked(Path(folder), Path(folder), os.O_RDONLY | os.O_DIRECTORY,
+                 'is writing there; wait until it has ended, or choose another folder'):
         yield
-    finally:
-        os.close(handle)
 
 
 @contextmanager
@@ -110,13 +107,20 @@ def only_keeper(path: str | Path) -> Iterator[None]:
     :raises StorageError: when another process keeps it, or its folder cannot be written to.
     """
     path = Path(path).resolve()
+    with _locked(path, path.with_name(f'.{path.name}.lock'), os.O_RDONLY | os.O_CREAT,
+                 'keeps it; end that one, or choose another file'):
+        yield
+
+
+@contextmanager
+def _locked(path: Path, lock: Path, flags: int, busy: str) -> Iterator[None]:
+    """Hold the lock of a path; busy says what another process does that holds it."""
     with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path.with_name(f'.{path.name}.lock'), os.O_RDONLY | os.O_CREAT, 0o666)
+        (lock if flags & os.O_DIRECTORY else lock.parent).mkdir(parents=True, exist_ok=True)
+        handle = os.open(lock, flags, 0o666)
     try:
         if not _lock(handle, wait=False):
-            raise StorageError(f'{escaped(path)}: another process keeps it; end that one, or '
-                               'choose another file')
+            raise StorageError(f'{escaped(path)}: another process {busy}')
         yield
     finally:
         os.close(handle)
@@ -157,13 +161,3 @@ def _open_alone(part: Path) -> FileIO:
             stream.close()
             raise
         stream.close()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Bring the name of a new file to the disk, where the file system can."""
-    with suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

@@ -9,13 +9,12 @@ Another package adds one by an entry point, without a fork:
     xarm7 = 'my_package.xarm7:XARM7'
 """
 
-from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
 from tap_ros.base.errors import ConfigError
-from tap_ros.base.text import escaped
+from tap_ros.base.text import escaped, meant
 
 # By group: name -> 'module:attribute'.
 BUILT_IN: dict[str, dict[str, str]] = {
@@ -36,8 +35,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         'stack2': 'sim_bridge.tasks.stack:STACK2', 'stack3': 'sim_bridge.tasks.stack:STACK3'},
     'tap_ros.trackers': {'rigid': 'tap_ros.tracking.rigid_tracker:RigidTracker'},
     'tap_ros.worlds': {'metaworld': 'sim_bridge.metaworld:MetaWorld',
-                       'mujoco_table': 'sim_bridge.simulator:Simulator',
-                       'ogbench': 'sim_bridge.ogbench:OGBench'},
+                       'mujoco_table': 'sim_bridge.simulator:Simulator'},
 }
 
 _HAS = {  # an attribute of what entry points of a group name; of others that they can be called
@@ -79,6 +77,5 @@ def load_plugin(group: str, name: str) -> Any:
                 f'uninstall it') from error
         return found
     valid = names(group)
-    near = get_close_matches(name, valid, 1)
-    meant = f'did you mean {near[0]!r}? ' if near else ''
-    raise ConfigError(f'{kind} {name!r} is unknown; {meant}valid: {", ".join(valid) or "none"}')
+    raise ConfigError(f'{kind} {name!r} is unknown; {meant(name, valid)}valid: '
+                      f'{", ".join(valid) or "none"}')

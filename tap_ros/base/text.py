@@ -3,6 +3,7 @@
 """Text that comes from outside (messages, files), made fit for a log line or a terminal."""
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 LIMIT = 200  # characters that are shown of one text
 
@@ -31,3 +32,9 @@ def listing(names: Iterable[object], limit: int = 8) -> str:
     names = list(names)
     shown = ', '.join(escaped(name, 60) for name in names[:limit])
     return shown if len(names) <= limit else f'{shown} and {len(names) - limit} more'
+
+
+def meant(name: str, valid: Iterable[str]) -> str:
+    """Return "did you mean 'the nearest'? " of valid names; '' where none is near."""
+    near = get_close_matches(name, valid, 1)
+    return f'did you mean {near[0]!r}? ' if near else ''

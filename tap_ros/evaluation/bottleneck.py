@@ -15,7 +15,7 @@ from tap_ros.planning.cost import distances_to_pixels
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps, WarpedMaps
 from tap_ros.recording.episode import Episode
-from tap_ros.training.batches import fixed_time, uses_recorded_goal
+from tap_ros.training.batches import uses_recorded_goal
 import torch
 
 THRESHOLDS = tuple(range(11))  # px
@@ -40,11 +40,11 @@ def bottleneck_scores(maps: torch.Tensor, start_pixels: torch.Tensor,
     :param goal_pixels: (B, K, 2), in the goal picture.
     :return: (B,), in pixels.
     """
-    return _least_sum(*(distances_to_pixels(maps, pixels) for pixels in (
+    return least_sum(*(distances_to_pixels(maps, pixels) for pixels in (
         start_pixels, goal_pixels)))
 
 
-def _least_sum(to_start: torch.Tensor, to_goal: torch.Tensor) -> torch.Tensor:
+def least_sum(to_start: torch.Tensor, to_goal: torch.Tensor) -> torch.Tensor:
     """Return (B,), the least sum of distances (B, K) with some objects moved, but not all."""
     halfway = list(product((False, True), repeat=to_start.shape[1]))[1:-1]
     scores = [torch.where(torch.tensor(moved, device=to_start.device), to_goal, to_start).sum(1)
@@ -79,46 +79,6 @@ def predicted_maps(pixels: np.ndarray, prediction: Prediction, b: int) -> Warped
     pixels = torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device)
     warped = warp_object_maps(one_hot_maps(pixels, flow.shape[-2:])[None], flow, masks)
     return WarpedMaps(warped.maps[0], warped.mass[0])
-
-
-def target_bottlenecks(episodes: Sequence[Episode], fraction: float,
-                       goal_picture: str) -> np.ndarray:
-    """
-    Score the true frames at a fixed time: whether that time is a bottleneck by itself.
-
-    :param episodes: list of N Episodes.
-    :param fraction: of the episode, 0..1.
-    :param goal_picture: see batches.uses_recorded_goal.
-    :return: float32 (N,), in pixels; NaN as in score_bottlenecks.
-    """
-    result = np.full(len(episodes), np.nan, np.float32)
-    for n, episode in enumerate(episodes):
-        pixels, end = context_pixels(episode, goal_picture), len(episode.frames) - 1
-        if can_be_bottleneck(pixels):
-            target = fixed_time(fraction, end, 1, end - 1)
-            gaps = np.linalg.norm(episode.object_pixels[target] - pixels, axis=-1)
-            to_start, to_goal = torch.from_numpy(gaps)[:, None]
-            result[n] = _least_sum(to_start, to_goal).item()
-    return result
-
-
-def bottleneck_share(episode: Episode, threshold: float = 2.0) -> float:
-    """
-    Find when in an episode the first object is home and the others are untouched.
-
-    :param episode: the Episode; home is where an object lies in the last frame.
-    :param threshold: px, the sum over the objects, up to which a frame is such a bottleneck.
-    :return: where the middle of these frames is, from 0 (the first frame) to 1 (the last); NaN
-        where there are none, or no frame can be one.
-    """
-    pixels = np.stack([episode.object_pixels[0], episode.object_pixels[-1]])
-    if not can_be_bottleneck(pixels):
-        return float('nan')
-    to_start, to_goal = (
-        np.linalg.norm(episode.object_pixels - place, axis=-1) for place in pixels)  # (T, K)
-    scores = (to_start.sum(1, keepdims=True) - to_start + to_goal).min(1)
-    frames = np.flatnonzero(scores <= threshold)
-    return float(frames.mean() / (len(scores) - 1)) if len(frames) else float('nan')
 
 
 def can_be_bottleneck(pixels: np.ndarray) -> bool:

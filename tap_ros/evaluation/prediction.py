@@ -7,7 +7,7 @@ All errors are per-pixel means of the absolute difference on [0, 1]. Copying the
 picture goes through the same measurement: a low error alone proves nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,17 +20,16 @@ from tap_ros.evaluation.bottleneck import (
     VISIBLE,
 )
 from tap_ros.evaluation.intervals import against_copying, bootstrap, Interval, mean_interval
-from tap_ros.evaluation.samples import draw_latents
 from tap_ros.evaluation.shown import SHOWN, ShownScorer
 from tap_ros.images.pixels import to_float
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
-from tap_ros.prediction.protocol import Predictor, Question
+from tap_ros.prediction.protocol import Predictor, Request
 from tap_ros.prediction.warp import WarpedMaps
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.batches import Batch, make_batch, Pictures, Sampling
-from tap_ros.training.inpainted import Filled
+from tap_ros.training.frames import FilledStore
 import torch
 
 METHODS = ('prediction', 'copy-start', 'copy-goal')
@@ -112,7 +111,7 @@ class EpisodeScores:
 
 def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
              episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-             filled: Filled | None = None) -> dict[str, EpisodeScores]:
+             filled: FilledStore | None = None) -> dict[str, EpisodeScores]:
     """
     Measure a predictor, and copying, on episodes it was not trained on.
 
@@ -126,13 +125,10 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
     :param filled: the targets without the robot, see batches.make_batch.
     :return: dict from METHODS (without copy-goal where there is no goal) to EpisodeScores.
     """
-    forward = is_forward(network)
-    methods = METHODS[:2] if forward else METHODS
-    parts: dict[str, list[list[np.ndarray]]] = {method: [] for method in methods}
+    parts: dict[str, list[list[np.ndarray]]] = {}
     for at in range(0, len(episodes), _BATCH):
         chosen = episodes[at:at + _BATCH]
-        batch = make_batch(store, chosen, Sampling(
-            goal_picture=goal_picture, forward=forward), pictures=Pictures(filled=filled))
+        batch = all_targets(network, store, chosen, goal_picture, filled)
         with torch.inference_mode():
             if isinstance(network, torch.nn.Module):
                 batch = batch.to(next(network.parameters()).device)
@@ -142,7 +138,7 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
             errors = l1_errors(images, batch.targets.movedim(-1, 2))          # B, 1 + C, T
             placed, mass = score_bottlenecks([store[i] for i in chosen], maps_of, goal_picture)
         scorers = [ShownScorer(store[i]) for i in chosen]
-        for m, method in enumerate(methods):
+        for m, method in enumerate(METHODS[:errors.shape[1]]):
             match = match_step(errors[:, m], batch.valid)[:, None]
             times = batch.times.gather(1, match)
             copied = errors[:, 1:].amin(1).gather(1, match)[:, 0].cpu().numpy()
@@ -151,22 +147,27 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
             pictures = ((images[:, m] + 1) / 2).movedim(1, -1).cpu().numpy()
             shown = [scorer.score(picture, int(time)) for scorer, picture, time in zip(
                 scorers, pictures, times[:, 0].tolist())]
-            parts[method].append([*(part[:, 0].cpu().numpy() for part in row), placed[:, m],
-                                  mass[:, m], *np.array(shown).T, copied])
+            parts.setdefault(method, []).append(
+                [*(part[:, 0].cpu().numpy() for part in row), placed[:, m], mass[:, m],
+                 *np.array(shown).T, copied])
     return {method: EpisodeScores(*(np.concatenate(column) for column in zip(*rows)))
             for method, rows in parts.items()}
 
 
-def is_forward(network: PredictorNetwork | Predictor) -> bool:
-    """Say whether a predictor is given the start picture alone."""
-    return network.config.num_context == 1 if isinstance(network, torch.nn.Module) else (
+def all_targets(network: PredictorNetwork | Predictor, store: EpisodeStore,
+                episodes: Sequence[int] | np.ndarray, goal_picture: str,
+                filled: FilledStore | None) -> Batch:
+    """Return what a predictor is given of episodes, and all frames that count; see evaluate."""
+    forward = network.config.num_context == 1 if isinstance(network, torch.nn.Module) else (
         network.mode == 'forward')
+    return make_batch(store, episodes, Sampling(goal_picture=goal_picture, forward=forward),
+                      pictures=Pictures(filled=filled))
 
 
 def ask(network: PredictorNetwork | Predictor, batch: Batch,
         episodes: Sequence[int] | np.ndarray) -> tuple[torch.Tensor, MapsOf]:
     """
-    Ask a predictor; of one with z, the first sample that samples.draw_latents draws.
+    Ask a predictor; of one with z, the first sample that draw_latents draws.
 
     :param batch: of the episodes.
     :return: pictures (B, 3, H, W) in [-1, 1], and their maps, see score_bottlenecks.
@@ -180,11 +181,25 @@ def ask(network: PredictorNetwork | Predictor, batch: Batch,
     return prediction.image, lambda b, pixels: predicted_maps(pixels, prediction, b)
 
 
+def draw_latents(episodes: Iterable[int], count: int, size: int) -> torch.Tensor:
+    """
+    Draw z from the prior, for each episode its own, whichever others are asked for.
+
+    :param episodes: (B,) indices of episodes.
+    :param count: samples of each; fewer are the first ones of more.
+    :param size: length of z.
+    :return: float32 (B, count, size).
+    """
+    return torch.from_numpy(np.stack([
+        np.random.default_rng([0, int(i)]).standard_normal((count, size), np.float32)
+        for i in episodes]))
+
+
 def _ask_another(predictor: Predictor, batch: Batch) -> tuple[torch.Tensor, MapsOf]:
     """Return what another predictor shows, as ask."""
     def answer(b: int, pixels: np.ndarray) -> Subgoal:
         names = ('start', 'goal')[:batch.context.shape[1]]
-        return predictor.predict_together([Question(
+        return predictor.predict_together([Request(
             **dict(zip(names, batch.context[b].numpy())),
             **{f'{name}_pixels': at for name, at in zip(names, pixels)})])[0][0]
 

@@ -3,60 +3,41 @@
 """Strips for people: what is predicted, which real frame it matches, and whether that is hit."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
-from tap_ros.base.files import write_atomically
 from tap_ros.evaluation.bottleneck import context_pixels
-from tap_ros.evaluation.keyframes import is_hit, SMOOTH
-from tap_ros.evaluation.prediction import ask, is_forward
-from tap_ros.images.drawing import enlarge, GAP, grid, overlay, png_bytes
+from tap_ros.evaluation.hits import is_hit
+from tap_ros.evaluation.prediction import all_targets, ask
+from tap_ros.images.drawing import enlarge, GAP, grid, overlay
 from tap_ros.images.pixels import to_uint8
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.protocol import Predictor
 from tap_ros.recording.cache import EpisodeStore
-from tap_ros.recording.marks import Mark, Marks
-from tap_ros.training.batches import make_batch, Pictures, Sampling
-from tap_ros.training.inpainted import Filled
+from tap_ros.recording.marks import Marks
+from tap_ros.training.frames import FilledStore
 import torch
 
 _SIDE = 128  # least pixels a side of a picture in a strip
 _LINE = 18  # pixels between lines of text
-_MATCHED, _MARKED = (220, 38, 127), (190, 230, 190)  # rgb
-
-
-def write_strips(path: str | Path, network: PredictorNetwork | Predictor, store: EpisodeStore,
-                 episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-                 filled: Filled | None = None, marks: Marks | None = None) -> None:
-    """
-    Write a sheet of strips, a row for each episode, see draw_strips.
-
-    :param path: .png file to write.
-    """
-    write_atomically(path, png_bytes(draw_strips(
-        network, store, episodes, goal_picture, filled, marks)))
 
 
 def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
                 episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-                filled: Filled | None = None, marks: Marks | None = None) -> np.ndarray:
+                filled: FilledStore | None = None, marks: Marks | None = None) -> np.ndarray:
     """
     Draw a sheet of strips, a row for each episode.
 
     Columns: its number, which frame is matched and whether that is a marked one; start,
-    prediction, matched frame, goal if one is given; how much the pictures change over time, with
-    the matched frame as a line and marks as bands; and the prediction with its object maps where
+    prediction, matched frame, goal if one is given; and the prediction with its object maps where
     the objects are known and no pixel is new.
 
     :param network: as for prediction.evaluate; filled: likewise.
     :param goal_picture: see batches.make_batch.
     :return: uint8 (height, width, 3).
     """
-    batch = make_batch(store, episodes, Sampling(
-        goal_picture=goal_picture, forward=is_forward(network)),
-                       pictures=Pictures(filled=filled))
+    batch = all_targets(network, store, episodes, goal_picture, filled)
     with torch.inference_mode():
         image, maps_of = ask(network, batch, episodes)
         visible = batch.visible(image[:, None].cpu())
@@ -64,7 +45,7 @@ def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
     match, images = match_step(errors, batch.valid), to_uint8(image.cpu())
     paints = isinstance(network, PredictorNetwork) and network.config.new_pixels
     scale, titles = -(-_SIDE // images.shape[1]), ['', 'start', 'prediction', 'matched frame']
-    titles += ['goal'] * (batch.context.shape[1] - 1) + ['speed, matched frame']
+    titles += ['goal'] * (batch.context.shape[1] - 1)
     rows = []
     for b, i in enumerate(map(int, episodes)):
         at, last = int(batch.times[b, match[b]]), int(batch.end[b])
@@ -78,8 +59,6 @@ def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
         hit = ['hit' if is_hit(window, at) else 'next to it' if is_hit(window, at, 1) else 'miss']
         said = write_lines([f'episode {i}', f'{at} of {last}', *hit * bool(window)],
                            panels[0].shape[:2])
-        curve = draw_speed(store.frames(i), at, window, panels[0].shape[:2])
-        panels.insert(len(titles) - 2, curve)
         rows.append([said, *panels])
     titles += ['object maps'] * (max(map(len, rows)) - len(titles))
     head = grid([[write_lines([title], (_LINE, rows[0][0].shape[1])) for title in titles]])
@@ -92,29 +71,4 @@ def write_lines(lines: Sequence[str], size: tuple[int, int]) -> np.ndarray:
     for number, line in enumerate(lines, start=1):
         cv2.putText(canvas, line, (2, number * _LINE - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4,
                     (0, 0, 0), 1, cv2.LINE_AA)
-    return canvas
-
-
-def draw_speed(frames: np.ndarray, matched: int, window: Sequence[Mark],
-               size: tuple[int, int]) -> np.ndarray:
-    """
-    Draw the mean change from each frame to the next over time, smoothed, as uint8 (H, W, 3).
-
-    :param matched: frame that gets a line; window: marks, which get bands.
-    :param size: (H, W) of the picture.
-    """
-    height, width = size
-    canvas = np.full((height, width, 3), 255, np.uint8)
-    moves = np.abs(np.diff(frames.astype(np.float32), axis=0)).mean((1, 2, 3))
-    speed = np.convolve(np.pad(moves, 1, 'edge'), SMOOTH, 'valid')
-
-    def column(t: float) -> int:
-        return round(t / (len(frames) - 1) * (width - 1))
-
-    for first, last in window:
-        canvas[:, column(first - 0.5):column(last + 0.5) + 1] = _MARKED
-    canvas[:, column(matched) - 1:column(matched) + 1] = _MATCHED
-    points = [(column(t + 0.5), round((height - 5) * (1 - value / max(speed.max(), 1e-6))) + 2)
-              for t, value in enumerate(speed.tolist())]
-    cv2.polylines(canvas, [np.array(points, np.int32)], False, (0, 0, 0), 1, cv2.LINE_AA)
     return canvas

@@ -18,11 +18,9 @@ MAX_NAME = 100  # characters
 
 
 def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray | None,
-                   stamp: Stamp | int, frame_id: str, source: str,
-                   states: Sequence[str] = (),
-                   confidence: Sequence[float] | np.ndarray = ()) -> dict[str, Any]:
+                   stamp: Stamp | int, frame_id: str, source: str) -> dict[str, Any]:
     """
-    Return the fields of a tap_msgs/ObjectStates.
+    Return the fields of a tap_msgs/ObjectStates, all seen.
 
     :param names: K strings.
     :param pixels: (K, 2) as (u, v).
@@ -30,19 +28,15 @@ def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray |
     :param stamp: of the image that the pixels belong to, a Stamp or ns.
     :param frame_id: frame of the poses.
     :param source: one of the SOURCE_ constants of ObjectStates.
-    :param states: K of its STATE_ constants, or none: all are seen.
-    :param confidence: K, 0 to 1, or none.
     """
-    objects = []
-    poses = np.full((len(pixels), 7), np.nan) if poses is None else poses
-    for name, pixel, pose in zip(names, pixels, poses):
-        numbers = [float(value) for value in pose]
-        objects.append({
-            'name': name, 'u': float(pixel[0]), 'v': float(pixel[1]),
-            'pose': {'position': dict(zip('xyz', numbers[:3])),
-                     'orientation': dict(zip('xyzw', numbers[3:]))}})
-    return {'header': header_fields(stamp, frame_id), 'source': source, 'objects': objects,
-            'states': list(states), 'confidence': [float(value) for value in confidence]}
+    numbers = np.full((len(pixels), 9), np.nan)
+    numbers[:, :2] = pixels
+    if poses is not None:
+        numbers[:, 2:] = poses
+    return {'header': header_fields(stamp, frame_id), 'source': source, 'objects': [
+        {'name': name, 'u': u, 'v': v, 'pose': {
+            'position': dict(zip('xyz', pose[:3])), 'orientation': dict(zip('xyzw', pose[3:]))}}
+        for name, (u, v, *pose) in zip(names, numbers.tolist())]}
 
 
 def decode_states(message: Any, name: str) -> tuple[str, ...]:

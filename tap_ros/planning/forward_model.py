@@ -115,23 +115,19 @@ class LearnedForwardModel(nn.Module):
         self.push = PushNet(config.features + 1, config.width, config.blocks, crop)
         size = config.sprite_size
         sprite = torch.zeros(4, 4, size, size)  # (basis 1 x y z, rgb and mask logit)
-        distance = (pixel_points((size, size)) - (size - 1) / 2).norm(dim=-1)
-        sprite[0, 3] = 2 - distance
+        sprite[0, 3] = 2 - (pixel_points((size, size)) - (size - 1) / 2).norm(dim=-1)
         self.sprite = nn.Parameter(sprite)
-
-        def constant(name: str, value: torch.Tensor) -> None:
+        for name, value in {
+                'homography': torch.tensor(config.table).view(3, 3).float(),
+                'arm_camera': torch.tensor(config.arm).view(3, 4).float(),
+                'grid': grid_points(config.table_cells).movedim(-1, 0).contiguous(),
+                'ahead': torch.tensor([1.0, 0.0]),
+                'pixels': pixel_points((config.image_size, config.image_size)),
+                'crop': (crop.flatten(0, 1) / config.table_half).T.contiguous(),
+                'limits': torch.tensor([[*config.workspace_low, 0.0],
+                                        [*config.workspace_high, 1.0]]),
+                'move_limit': torch.tensor(ACTION_LIMIT)}.items():
             self.register_buffer(name, value, persistent=False)
-
-        constant('homography', torch.tensor(config.table).view(3, 3).float())
-        constant('arm_camera', torch.tensor(config.arm).view(3, 4).float())
-        constant('grid', grid_points(config.table_cells).movedim(-1, 0).contiguous())
-        constant('ahead', torch.tensor([1.0, 0.0]))
-        constant('pixels', pixel_points((config.image_size, config.image_size)))
-        constant('crop', (crop.flatten(0, 1) / config.table_half).T.contiguous())
-        low = torch.tensor([*config.workspace_low, 0.0])
-        high = torch.tensor([*config.workspace_high, 1.0])
-        constant('limits', torch.stack([low, high]))
-        constant('move_limit', torch.tensor(ACTION_LIMIT))
 
     @classmethod
     def load(cls, path: str | Path, device: torch.device | str = 'cpu',
@@ -205,12 +201,11 @@ class LearnedForwardModel(nn.Module):
         :param homography: (B, 3, 3) where it differs from the model's.
         :return: Look.
         """
-        if homography is None:
-            homography = self.homography.expand(len(image), 3, 3)
         features, objects, background = self.encoder(image, arm_mask)
-        at = self.table.points().expand(len(image), -1, -1)
-        at = project(homography, at).unflatten(1, self.grid.shape[1:])
-        return Look(sample_picture(features, at), objects, background)
+        at = project(self.homography if homography is None else homography,
+                     self.table.points().expand(len(image), -1, -1))
+        return Look(sample_picture(features, at.unflatten(1, self.grid.shape[1:])), objects,
+                    background)
 
     def still(self, count: int) -> torch.Tensor:
         """Return the flow (count, 2, n, n) of a scene in which nothing has moved."""
@@ -303,10 +298,9 @@ class LearnedForwardModel(nn.Module):
         """
         if homography is None:
             homography = self.homography.expand(len(flow), 3, 3)
-        pixels = self.pixels
         half = self.config.table_half
-        table = project(torch.linalg.inv(homography), pixels.flatten(0, 1)) / half
-        table = table.unflatten(1, pixels.shape[:2]).movedim(-1, 1)  # (B, 2, H, W)
+        table = project(torch.linalg.inv(homography), self.pixels.flatten(0, 1)) / half
+        table = table.unflatten(1, self.pixels.shape[:2]).movedim(-1, 1)  # (B, 2, H, W)
         source = shifted(table, flow, 'zeros').movedim(1, -1)
         source = project(homography, source.flatten(1, 2) * half).view_as(source)
         objects = sample_picture(scene.objects, source)

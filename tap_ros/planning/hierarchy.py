@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.base.contract import GOAL_TOLERANCE
 from tap_ros.base.errors import ConfigError
-from tap_ros.planning.action_sequences import FULL, gripper_after, Limits
+from tap_ros.planning.action_sequences import gripper_after
 from tap_ros.planning.cost import distances_to_all_pixels
 from tap_ros.planning.mpc_config import SWITCHES
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import Goal, Plan, Scene, VisualMPC
 
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
@@ -125,31 +124,28 @@ def targets_by(subgoals: Iterable['Subgoal'], goal_pixels: np.ndarray) -> list[T
 
 
 def choose_sample(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
-                  subgoals: Iterable['Subgoal'], seed: int = 0, limits: Limits = FULL,
-                  before_plan: Callable[[], object] = lambda: None) -> list['Subgoal']:
+                  subgoals: Iterable['Subgoal'],
+                  plan: Callable[[Scene, Goal], Plan]) -> list['Subgoal']:
     """
     Take the predicted subgoals of one sample: those whose legs the planner expects to cost least.
 
     A leg goes to the first subgoal from what is seen, then from each predicted picture to the next
     target, the arm standing where the plan before left it.
 
-    :param scene: mpc_inputs.Scene, what is seen now.
+    :param scene: visual_mpc.Scene, what is seen now.
     :param goal_pixels: (K, 2).
     :param subgoals: of any samples, earliest first in each.
-    :param seed: of the planner; limits: of its actions.
-    :param before_plan: called before every plan; what it raises ends the choice.
+    :param plan: makes the plan of a leg, by `mpc`; what it raises ends the choice.
     :return: those of the sample taken, earliest first; the first of equals.
     """
     def cost(chain: list['Subgoal']) -> float:
         total, now = 0.0, scene
         for subgoal in [*chain, None]:
-            before_plan()
-            target = (mpc.goal(goal_pixels) if subgoal is None
-                      else mpc.goal(maps=subgoal.object_maps))
-            plan = mpc.plan(now, target, Memory(seed), limits)
-            total += plan.cost
+            leg = plan(now, mpc.goal(goal_pixels) if subgoal is None
+                       else mpc.goal(maps=subgoal.object_maps))
+            total += leg.cost
             if subgoal is not None:
-                hand = gripper_after(now.gripper, plan.actions)
+                hand = gripper_after(now.gripper, leg.actions)
                 now = Scene(subgoal.image, hand, subgoal.expected_pixels)
         return total
 

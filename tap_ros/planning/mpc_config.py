@@ -11,7 +11,6 @@ from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.protocols import SearchConfig, Solver
 
 SWITCHES = ('reached', 'half')  # when to go on from a subgoal, see hierarchy.py
-FIRST_SCENE = 1_000_000  # seed of the scenes that are planned in, far from the recordings'
 PLANNING_TASKS = ('push2', 'push3', 'order2', 'order3')
 
 
@@ -77,11 +76,3 @@ def with_preset(name: str, **changes: Any) -> VisualMPCConfig:
     if name not in PRESETS:
         raise ConfigError(f'preset {name!r} is unknown; valid presets: {", ".join(PRESETS)}')
     return replace(PRESETS[name], **changes)
-
-
-def with_samples(config: VisualMPCConfig, num_samples: int) -> VisualMPCConfig:
-    """Return a config with so many samples, and elites and proposals in proportion."""
-    share = num_samples / config.search.num_samples
-    search = replace(config.search, num_samples=num_samples,
-                     num_elites=max(2, round(share * config.search.num_elites)))
-    return replace(config, search=search, proposals=int(share * config.proposals))

@@ -22,7 +22,7 @@ class ForwardModel(Protocol):
     """
     Says where objects go when the gripper moves, as maps on a square grid of the table.
 
-    forward_model.LearnedForwardModel and true_model.TrueModel are two.
+    forward_model.LearnedForwardModel and sim_bridge.true_model.TrueModel are two.
     """
 
     @property
@@ -34,9 +34,10 @@ class ForwardModel(Protocol):
         """
         Look once at what all sequences of a plan begin with.
 
-        :param image: (1, 3, H, W) in [-1, 1]; gripper (1, 4) metres and opening.
+        :param image: float32 (1, 3, H, W) in [-1, 1], of table.image_size.
+        :param gripper: float32 (1, 4): x, y, z in metres, and opening, 0 to 1.
         :param arm_hidden: the arm is not in the picture.
-        :return: what carried_maps takes first.
+        :return: what carried_maps takes first; the planner does not look into it.
         """
 
     def carried_maps(self, start: Any, gripper: 'torch.Tensor', maps: 'torch.Tensor',
@@ -44,10 +45,13 @@ class ForwardModel(Protocol):
         """
         Yield the maps (N, K, n, n) after every so many steps of N action sequences.
 
-        :param start: from begin; gripper (N, 4), where each sequence begins.
-        :param maps: (K, n, n) now.
-        :param actions: (N, T, 4), T a multiple of `every`.
-        :return: each map sums to 1, or to 0 where nobody knows where the object is.
+        :param start: from begin.
+        :param gripper: float32 (N, 4), where each sequence begins.
+        :param maps: float32 (K, n, n) now, on the n x n cells of the table; each sums to 1.
+        :param actions: float32 (N, T, 4): dx, dy, dz in metres in a control period, and opening;
+            T a multiple of `every`.
+        :return: T / every tensors float32; each map sums to 1, or to 0 where nobody knows where
+            the object is. Called from several threads at once.
         """
 
 
@@ -101,12 +105,16 @@ class Solution:
 
 
 class Solver(Protocol):
-    """Searches the minimum of a Problem; solvers.cem and solvers.icem are two."""
+    """Searches the minimum of a Problem: a function; solvers.cem and solvers.icem are two."""
 
     def __call__(self, problem: Problem, config: SearchConfig,
                  rng: np.random.Generator) -> Solution:
         """
         Search.
 
+        :param problem: its cost takes samples, float64 (N, D), and returns (N,) costs in pixels.
+            What it raises goes on to the planner: time is over.
+        :param config: how many samples, iterations and elites.
         :param rng: all randomness comes from it, in an order that depends on the shapes only.
+        :return: Solution: the best sample (D,), its cost, and the elites (E, D), cheapest first.
         """

@@ -7,8 +7,8 @@ visual_mpc_node and the evaluation both drive it, so that they act alike:
 
     reach = Reach(mpc, ReachConfig(step_budget=40), seed)
     while not isinstance(answer := reach.step(seen), End):
-        if isinstance(answer, Aim):
-            reach.head_for(targets)          # decided from answer.seen
+        if isinstance(answer, SelectTargets):
+            reach.set_targets(targets)          # decided from answer.seen
         elif isinstance(answer, Command):
             seen = carry_out(answer.plan.action)
             reach.sent()
@@ -24,8 +24,7 @@ from tap_ros.base.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.base.text import listing
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.hierarchy import Itinerary, Target
-from tap_ros.planning.mpc_inputs import Goal, Scene
-from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
+from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 from tap_ros.tracking.protocols import LOST, UNSURE
 
 MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
@@ -35,8 +34,8 @@ SENDING = 0.1  # share of max_age that is left for sending a command
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What was seen at one moment."""
+class Observation:
+    """What is seen at one moment."""
 
     image: np.ndarray  # (H, W, 3) uint8
     gripper: np.ndarray  # (4,) metres and opening
@@ -77,10 +76,10 @@ class ReachConfig:
 
 
 @dataclass(frozen=True)
-class Aim:
-    """Decide from `seen` what to go to, and say so by Reach.head_for."""
+class SelectTargets:
+    """Decide from `seen` what to go to, and say so by Reach.set_targets."""
 
-    seen: Seen
+    seen: Observation
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class Command:
 
     plan: Plan
     stage: int  # index into Reach.targets
-    seen: Seen  # what it answers
+    seen: Observation  # what it answers
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ class _State:
     """What a plan changes; it counts once the command is sent."""
 
     memory: Memory
-    itinerary: Itinerary  # of this round, that is, of the last answer to an Aim
+    itinerary: Itinerary  # of this round, that is, of the last answer to SelectTargets
     round: int = 1
     first_step: int = 0  # of this round
     earlier: tuple[Target, ...] = ()  # subgoals passed in the rounds before
@@ -139,7 +138,7 @@ class Reach:
                  now: float = 0.0) -> None:
         self._mpc, self._config, self._seed = mpc, config, seed
         self._tabulated: tuple[Target, Goal] | None = None
-        self._first: Seen | None = None
+        self._first: Observation | None = None
         self._unsure: dict[str, list[int]] = {}  # object -> stamps of pictures in a row
         self._planned: Command | None = None
         self._answered: Command | None = None
@@ -156,7 +155,7 @@ class Reach:
 
     @property
     def targets(self) -> list[Target]:
-        """Return the subgoals of all rounds so far, then the goal; empty before head_for."""
+        """Return the subgoals of all rounds so far, then the goal; empty before set_targets."""
         return [*self._next.earlier, *self._next.itinerary.targets] if self._next else []
 
     @property
@@ -164,25 +163,25 @@ class Reach:
         """Return the steps at which the targets after the first one began."""
         return list(self._next.switches) if self._next else []
 
-    def step(self, seen: Seen | None, now: float = 0.0,
-             lacking: str = '') -> Aim | Command | Wait | End:
+    def step(self, seen: Observation | None, now: float = 0.0,
+             missing: str = '') -> SelectTargets | Command | Wait | End:
         """
         Answer what is seen.
 
-        :param seen: Seen, or None when nothing is.
-        :param now: s, on the clock of Seen.received.
-        :param lacking: why nothing is seen, or nothing new, for the message.
-        :return: Aim, Command, Wait or End.
+        :param seen: Observation, or None when nothing is.
+        :param now: s, on the clock of Observation.received.
+        :param missing: why nothing is seen, or nothing new, for the message.
+        :return: SelectTargets, Command, Wait or End.
         :raises PlanningError: for what cannot be planned with.
         """
         if self._refused >= MOST_REFUSED:
             return End('aborted', f'{self._refused} commands in a row were refused, the last one '
                                   f'as: {self._refusal}')
-        answer = self.interrupted(seen) or self._answer(seen, now, lacking)
+        answer = self.interrupted(seen) or self._answer(seen, now, missing)
         silence = now - self._sent_at
         if isinstance(answer, (Wait, Command)) and silence > self._config.timeout:
             why = answer.reason if isinstance(answer, Wait) else (
-                lacking or 'what is seen is always too old when its command is planned')
+                missing or 'what is seen is always too old when its command is planned')
             return End('aborted', f'no command could be sent for {silence:.1f} s: {why}')
         if isinstance(answer, Command) and answer is not self._planned:
             self._planned = answer
@@ -198,22 +197,27 @@ class Reach:
                     'or let this machine do less'))
         return answer
 
-    def _answer(self, seen: Seen | None, now: float, lacking: str) -> Aim | Command | Wait | End:
+    def _answer(self, seen: Observation | None, now: float,
+                missing: str) -> SelectTargets | Command | Wait | End:
         """Answer what is seen, whatever the time that has passed without a command."""
         if seen is None:
-            return Wait(lacking or 'nothing is seen')
-        reason = self._unusable(seen, now, lacking)
-        if reason:
-            return Wait(reason)
+            return Wait(missing or 'nothing is seen')
+        if seen.stamp_ns <= self._after_ns:
+            return Wait(f'the last command was refused: {self._refusal}' if self._before is None
+                        and self._refusal else missing or 'no new picture since the last command')
+        if seen.stamp_ns < seen.scene_ns:
+            return Wait('the picture is of an old scene')
+        age = now - seen.received
+        if age > self._config.max_age:
+            return Wait(f'what was seen is {age:.1f} s old' + (f': {missing}' if missing else ''))
         if self._planned is not None and self._planned.seen.stamp_ns == seen.stamp_ns:
             return self._planned
         self._first = self._first or seen
         if self._state is None:
-            return Aim(seen)
-        return self._plan(
-            seen, self._state, seen.received + (1 - SENDING) * self._config.max_age - now)
+            return SelectTargets(seen)
+        return self._plan(seen, self._state, (1 - SENDING) * self._config.max_age - age)
 
-    def interrupted(self, seen: Seen | None) -> End | None:
+    def interrupted(self, seen: Observation | None) -> End | None:
         """
         Return the End if another scene is seen, or an object cannot be found, else None.
 
@@ -221,13 +225,12 @@ class Reach:
         """
         if seen is None:
             return None
-        change = scene_change(self._first, seen) if self._first is not None else ''
-        if change:
+        if self._first is not None and (change := scene_change(self._first, seen)):
             return End('aborted', f'the scene has changed: {change}')
         doubt = self._doubt(seen) if seen.stamp_ns >= seen.scene_ns else ''
         return End('aborted', doubt) if doubt else None
 
-    def _doubt(self, seen: Seen) -> str:
+    def _doubt(self, seen: Observation) -> str:
         """Say which objects can no longer be followed; an empty string if all can."""
         lost = [name for name, state in zip(seen.names, seen.states) if state == LOST]
         if lost:
@@ -243,7 +246,7 @@ class Reach:
                         'and select the objects again')
         return ''
 
-    def head_for(self, targets: Sequence[Target], now: float = 0.0) -> None:
+    def set_targets(self, targets: Sequence[Target], now: float = 0.0) -> None:
         """
         Say what to go to; what is left of the step budget is for these targets.
 
@@ -255,12 +258,11 @@ class Reach:
         state = _State(Memory(self._seed), Itinerary(
             targets, self._budget - self.steps, config.switch, config.reached))
         if passed is not None and self._state is not None:
-            memory = self._state.memory
-            state = replace(state, round=passed.round + 1, first_step=self.steps,
-                            memory=replace(state.memory, heights=memory.heights,
-                                           blocked=memory.blocked),
-                            earlier=(*passed.earlier, *passed.itinerary.targets[:-1]),
-                            switches=passed.switches)
+            met = self._state.memory
+            state = replace(
+                state, memory=Memory(self._seed, heights=met.heights, blocked=met.blocked),
+                round=passed.round + 1, first_step=self.steps, switches=passed.switches,
+                earlier=(*passed.earlier, *passed.itinerary.targets[:-1]))
         self._state = self._next = state
         self._sent_at = now
 
@@ -300,19 +302,8 @@ class Reach:
         self._refusal, self._refused = reason, self._refused + 1
         return True
 
-    def _unusable(self, seen: Seen, now: float, lacking: str) -> str:
-        """Say why there is nothing to plan from; an empty string if there is."""
-        if seen.stamp_ns <= self._after_ns:
-            return (f'the last command was refused: {self._refusal}' if self._before is None
-                    and self._refusal else lacking or 'no new picture since the last command')
-        if seen.stamp_ns < seen.scene_ns:
-            return 'the picture is of an old scene'
-        age = now - seen.received
-        if age > self._config.max_age:
-            return f'what was seen is {age:.1f} s old' + (f': {lacking}' if lacking else '')
-        return ''
-
-    def _plan(self, seen: Seen, state: _State, seconds: float) -> Aim | Command | End:
+    def _plan(self, seen: Observation, state: _State,
+              seconds: float) -> SelectTargets | Command | End:
         """Plan the next command from a new picture within so many seconds."""
         config, itinerary = self._config, state.itinerary
         self._next = state
@@ -330,29 +321,21 @@ class Reach:
             state, switches=state.switches + (self.steps,) * (stage - before))
         if (0 < stage == len(itinerary.targets) - 1 and state.round < config.rounds
                 and self.steps > state.first_step):
-            return Aim(seen)
+            return SelectTargets(seen)
+        # tabulate the goal, once unless objects are free
+        target, known = itinerary.targets[stage], self._tabulated
+        if known is None or known[0] is not target or target.free is not None:
+            inside = np.clip(pixels, 0, np.array(seen.image.shape[1::-1]) - 1)
+            known = self._tabulated = target, self._mpc.goal(**target.goal(inside))
         # plan
-        limit = np.array(seen.image.shape[1::-1]) - 1
-        goal = self._goal(itinerary.targets[stage], np.clip(pixels, 0, limit))
-        plan = self._mpc.plan(
-            Scene(seen.image, seen.gripper, pixels), goal, state.memory, config.limits, seconds)
+        plan = self._mpc.plan(Scene(seen.image, seen.gripper, pixels), known[1], state.memory,
+                              config.limits, seconds)
         self._next = replace(state, memory=plan.memory)
         return Command(plan, len(state.switches), seen)
 
-    def _goal(self, target: Target, pixels: np.ndarray) -> Goal:
-        """Return the planner's Goal for a target, tabulated once unless objects are free."""
-        known = self._tabulated
-        if known is None or known[0] is not target or target.free is not None:
-            known = self._tabulated = target, self._mpc.goal(**target.goal(pixels))
-        return known[1]
 
-
-def scene_change(first: Seen, seen: Seen) -> str:
-    """
-    Say in what way the scene is another one; an empty string if it is not.
-
-    :param first: Seen at the start of a goal; seen: Seen now.
-    """
+def scene_change(first: Observation, seen: Observation) -> str:
+    """Say in what way a scene is another than at the start of a goal; '' if it is the same."""
     if seen.jumps != first.jumps:
         return 'the clock of its stamps has jumped: another simulator, or a recording that loops'
     if seen.scene_ns > first.stamp_ns:

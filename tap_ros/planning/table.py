@@ -10,6 +10,7 @@ a homography. Both are fitted from recordings, see fit_table and fit_arm.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,18 +55,14 @@ class Table:
         n = self.cells
         points = project(torch.linalg.inv(self.homography), pixels[:, None])
         at = ((points / self.half + 1) * (n - 1) / 2).clamp(0, n - 1.001)  # (K, 1, 2) x, y
-        low = at.floor()
-        share = at - low
-        low = low.long()
+        low = at.long()
+        shares = torch.stack([1 - (at - low), at - low])
         maps = pixels.new_zeros(len(pixels), n * n)
-        for dx in (0, 1):
-            for dy in (0, 1):
-                part = (share[..., 0] if dx else 1 - share[..., 0])
-                part = part * (share[..., 1] if dy else 1 - share[..., 1])
-                maps.scatter_add_(1, (low[..., 1] + dy) * n + low[..., 0] + dx, part)
-        line = pixels.new_tensor([1.0, 2.0, 1.0]) / 4
-        kernel = torch.outer(line, line)[None, None]
-        maps = F.conv2d(maps.view(-1, 1, n, n), kernel, padding=1)[:, 0]
+        for dx, dy in product((0, 1), repeat=2):
+            maps.scatter_add_(1, (low[..., 1] + dy) * n + low[..., 0] + dx,
+                              shares[dx, ..., 0] * shares[dy, ..., 1])
+        kernel = pixels.new_tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]) / 16
+        maps = F.conv2d(maps.view(-1, 1, n, n), kernel[None, None], padding=1)[:, 0]
         return maps / maps.sum((-1, -2), keepdim=True).clamp_min(1e-12)
 
 
@@ -140,8 +137,8 @@ def fit_projection(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         unit = homogeneous / rays[:, 2:]
         zero = np.zeros_like(unit)
         fall = -(rays[:, :2] / rays[:, 2:])[..., None] * unit[:, None, :-1]  # (N, 2, D)
-        jacobian = np.stack([np.hstack([unit, zero]), np.hstack([zero, unit])], axis=1)
-        jacobian = np.concatenate([jacobian, fall], axis=2)  # (N, 2, 3 D + 2)
+        jacobian = np.concatenate([np.stack([
+            np.hstack([unit, zero]), np.hstack([zero, unit])], 1), fall], 2)  # (N, 2, 3 D + 2)
         left = (jacobian * np.sqrt(weight)[:, None, None]).reshape(2 * count, -1)
         right = (error * np.sqrt(weight)[:, None]).reshape(-1)
         damping = 1e-6 * np.eye(left.shape[1])

@@ -13,23 +13,19 @@ carry the maps, take the one that brings them closest to their goals, execute it
         memory = plan.memory
 """
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 import math
-import os
 from pathlib import Path
 import time
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.base.contract import LOW
 from tap_ros.base.errors import PlanningError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.base.search import finite
-from tap_ros.images.pixels import to_float
+from tap_ros.images.pixels import check_image, check_pixels, in_picture, to_float
 from tap_ros.planning.action_sequences import (
     DOWN,
     FULL,
@@ -41,11 +37,11 @@ from tap_ros.planning.action_sequences import (
     SequenceShape,
     shift,
 )
-from tap_ros.planning.cost import PlanCost
+from tap_ros.planning.cost import distances_to_places, PlanCost
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import check_scene, Goal, Scene, tabulate
 from tap_ros.planning.protocols import ForwardModel, Problem, Solution, Solver
+from tap_ros.planning.rollouts import Rollouts, Start, TimeLimit, to_numpy
 import torch
 
 WARM_STD = 0.5  # share of the first deviation that a search around the last plan begins with
@@ -53,6 +49,40 @@ SHORT = 0.02  # m; a descent of which more is missing has met something,
 STILL = 0.9  # or of which this share is, where the arm comes down in small steps
 MOVED = 1.0  # px, from where an object was
 RECHECK_STD = 0.01  # m, from the gripper to the places from which elites are judged once more
+# What a gripper over the table can be: x, y, z in metres, opening. Anything else is another unit,
+# another frame or nonsense; learned models would answer it with a move all the same.
+GRIPPER_LOW = np.array([-1.0, -1.0, -0.1, -0.1], np.float32)
+GRIPPER_HIGH = np.array([1.0, 1.0, 1.0, 1.1], np.float32)
+
+
+class TimeIsOver(Exception):
+    """Ends the search of a solver."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """
+    What the robot sees.
+
+    :param image: (H, W, 3) uint8 rgb, of the size that the planner takes.
+    :param gripper: (4,), x, y, z in metres from the middle of the table, and opening, 0 to 1.
+    :param object_pixels: (K, 2), (u, v) of each object.
+    """
+
+    image: np.ndarray
+    gripper: np.ndarray
+    object_pixels: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """Where K objects should be."""
+
+    distances: torch.Tensor  # (K, n n) px, of every table cell from each object's goal
+    places: np.ndarray  # (K, 2) m, the table cells nearest to the goals
+
+    def __len__(self) -> int:
+        return len(self.distances)
 
 
 @dataclass(frozen=True)
@@ -142,7 +172,9 @@ class VisualMPC:
         """
         Load a learned forward model's weights.
 
-        :param path: safetensors file of kind 'forward_model'.
+        :param path: safetensors file of kind 'forward_model', such as weights.FORWARD_MODEL.
+        :param config: of the search; None: the default.
+        :param device: where to predict, 'cpu' or 'cuda'.
         :raises WeightsError: for a file that is missing, damaged or of another kind.
         """
         return cls(LearnedForwardModel.load(path, device), config)
@@ -153,8 +185,39 @@ class VisualMPC:
         return self.model.table.image_size
 
     def goal(self, pixels: ArrayLike | None = None, maps: ArrayLike | None = None) -> Goal:
-        """Tabulate a goal, given as pixels (K, 2) or as maps (K, H, W), see tabulate."""
-        return self.rollouts.compute(tabulate, self.model.table, pixels, maps)
+        """
+        Tabulate a goal once: how far each place on the table is from it.
+
+        For a goal map q the distance is the expected one, so that an object map p costs that
+        between the two, E_{p,q}|x - y|. Give exactly one of the two:
+
+        :param pixels: (K, 2) numbers, (u, v) of each object in a picture of image_size.
+        :param maps: (K, H, W) numbers of at least 0, one map of positive sum for each object.
+        :return: Goal, for plan.
+        :raises PlanningError: for goals that cannot be planned to; ImageError: for pixels of
+            another shape, or not finite.
+        """
+        if (maps is None) == (pixels is None):
+            raise PlanningError('goal: give exactly one of pixels and maps')
+        table, (height, width) = self.model.table, self.image_size
+        cells = self.rollouts.compute(table.pixels).flatten(0, 1)
+        if maps is None:
+            goals, distances_of = check_pixels(pixels, 'goal_pixels'), torch.cdist
+            outside = goals[~in_picture(goals, self.image_size)].tolist()
+            if outside:
+                raise PlanningError(f'goal_pixels: {outside} outside the {width}x{height} picture')
+        else:
+            goals, distances_of = np.ascontiguousarray(maps, np.float32), distances_to_places
+            if goals.ndim != 3 or goals.shape[1:] != (height, width):
+                raise PlanningError(f'goal_maps: expected shape (K, {height}, {width}), one map '
+                                    f'for each object, got {goals.shape}')
+            mass = goals.sum((1, 2))
+            if not np.isfinite(goals).all() or (goals < 0).any() or (mass <= 0).any():
+                raise PlanningError('goal_maps: expected finite values of at least 0 and a '
+                                    f'positive sum for each object, got sums {mass.tolist()}')
+        distances = self.rollouts.compute(
+            distances_of, torch.from_numpy(goals).to(cells.device), cells)
+        return Goal(distances, self._points[distances.argmin(1).cpu().numpy()])
 
     @torch.inference_mode()
     def plan(self, scene: Scene, goal: Goal, memory: Memory = Memory(),
@@ -162,14 +225,18 @@ class VisualMPC:
         """
         Choose the next action.
 
-        :param memory: of the plan before.
-        :param limits: of the actions.
+        :param scene: what is seen now, of K objects.
+        :param goal: of the same objects in the same order, see goal.
+        :param memory: of the plan before, Plan.memory; Memory(seed) at first.
+        :param limits: of the actions, m in a control period.
         :param seconds: that it may take. The search then ends early, with the best so far; at
             least as many samples are judged as are at once.
-        :raises PlanningError: for a scene that cannot be planned in.
+        :return: Plan; its action is (4,) float32, dx, dy, dz in m and opening, 0 to 1.
+        :raises PlanningError: for a scene that cannot be planned in; ImageError: for its picture
+            or pixels.
         """
         limit, begin = TimeLimit(seconds), time.perf_counter()
-        scene = check_scene(scene, self.image_size)
+        scene = checked(scene, self.image_size)
         if len(goal) != len(scene.object_pixels):
             raise PlanningError(f'goal: {len(goal)} goals for {len(scene.object_pixels)} objects; '
                                 'give one for each object, in the same order')
@@ -253,106 +320,20 @@ class VisualMPC:
         return solution, sum(int((~np.isnan(costs)).sum()) for _, costs in judged)
 
 
-class TimeIsOver(Exception):
-    """Ends the search of a solver."""
-
-
-class TimeLimit:
-    """
-    Lets the parts of a search begin that will end in time, judged by the longest so far.
-
-    :param seconds: from now on.
-    :ivar over: whether a part was left out.
-    """
-
-    def __init__(self, seconds: float = math.inf) -> None:
-        self._end, self._longest, self.over = time.perf_counter() + seconds, -math.inf, False
-
-    def run(self, part: Callable[[], Any]) -> Any:
-        """Return what a part returns, None if it is left out; those are run that begin at once."""
-        begin = time.perf_counter()
-        if self.over or begin + self._longest > self._end:
-            self.over = True
-            return None
-        found = part()
-        self._longest = max(self._longest, time.perf_counter() - begin)
-        return found
-
-
-@dataclass(frozen=True)
-class Start:
-    """What all sequences of a plan begin with."""
-
-    maps: torch.Tensor  # (K, n, n) of the objects now
-    features: Any  # from ForwardModel.begin
-    limit: TimeLimit = field(default_factory=TimeLimit)
-
-
-class Rollouts:
-    """
-    Carries object maps along action sequences and says what these cost.
-
-    :param model: ForwardModel; cost: PlanCost.
-    :param batch_size: sequences predicted at once, at most.
-    :param threads: on the CPU; 0: as many as there are cores. Each computes alone: so the bits
-        of a plan do not depend on how many threads torch is given.
-    """
-
-    def __init__(self, model: ForwardModel, cost: PlanCost, batch_size: int,
-                 threads: int = 0) -> None:
-        self.model, self.cost, self.batch_size = model, cost, batch_size
-        # Each thread predicts whole batches: operators split among threads would wait for each
-        # other at every one of some thousand small steps, and for anything else that runs.
-        self._pool = ThreadPoolExecutor(
-            (threads or len(os.sched_getaffinity(0))) if model.table.device.type == 'cpu' else 1,
-            initializer=torch.set_num_threads, initargs=(1,))
-
-    def compute(self, function: Callable[..., Any], *args: Any) -> Any:
-        """Return what a function of tensors returns, computed in one of the threads."""
-        return self._pool.submit(torch.inference_mode()(function), *args).result()
-
-    def judge(self, start: Start, prices: torch.Tensor, actions: np.ndarray,
-              grippers: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Judge action sequences by PlanCost.of_maps.
-
-        :param start: Start; what its limit leaves out is NaN.
-        :param prices: (K, n n) px, of an object in each table cell.
-        :param actions: numpy (N, HORIZON, 4); grippers (N, 4), where each sequence begins.
-        :param every: look at the maps after every so many steps.
-        :return: numpy costs (N,) float64, rounded to 0.01 px; prices at the end (N,).
-        """
-        size = -(-len(actions) // -(-len(actions) // self.batch_size))  # as even as can be
-
-        @torch.inference_mode()
-        def judge(actions: torch.Tensor,
-                  grippers: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            count = len(actions)  # the last part is filled up: all go the same way
-            actions, grippers = (torch.cat([t, t[-1:].expand(size - count, *t.shape[1:])])
-                                 for t in (actions, grippers))
-            carried = self.model.carried_maps(
-                start.features, grippers, start.maps, actions, every)
-            costs, ends = self.cost.of_maps(carried, prices)
-            return costs[:count], ends[:count]
-
-        # together with others that come down as late: up there, nothing needs to be predicted
-        heights = grippers[:, 2:3] + actions[..., 2].cumsum(1)
-        order = np.argsort((heights > LOW + 0.01).sum(1), kind='stable')
-        back = np.argsort(order)
-        parts = list(zip(*(torch.from_numpy(values[order]).to(prices.device).split(size)
-                           for values in (actions, grippers))))
-        # the part of the last sequence first: solvers put proposals there, such as the last plan
-        queue = sorted(range(len(parts)), key=lambda i: i != back[-1] // size)
-        running = {i: self._pool.submit(start.limit.run, partial(judge, *parts[i])) for i in queue}
-        found = [running[i].result() or prices.new_full((2, len(part[0])), torch.nan).unbind()
-                 for i, part in enumerate(parts)]
-        costs, ends = to_numpy(*map(torch.cat, zip(*found)))
-        # rounded so that the batch size, which moves the last bits, cannot change the ranking
-        return costs[back].astype(np.float64).round(2), ends[back]
-
-
-def to_numpy(*tensors: torch.Tensor) -> list[np.ndarray]:
-    """Bring tensors of one type to numpy in one trip, for each of which a GPU would wait."""
-    joined = torch.cat([tensor.flatten() for tensor in tensors]).cpu().numpy()
-    ends = np.cumsum([tensor.numel() for tensor in tensors])
-    return [part.reshape(tensor.shape) for part, tensor in zip(np.split(joined, ends), tensors)]
+def checked(scene: Scene, size: tuple[int, int]) -> Scene:
+    """Return a Scene with numbers as float32 if it can be planned in; see VisualMPC.plan."""
+    check_image(scene.image, 'image', size)
+    pixels = check_pixels(scene.object_pixels, 'object_pixels')
+    if not len(pixels):
+        raise PlanningError('object_pixels: no objects; give the position of one at least')
+    gripper = np.ascontiguousarray(scene.gripper, np.float32)  # torch takes no flipped views
+    if gripper.shape != (4,) or not np.isfinite(gripper).all():
+        raise PlanningError(
+            f'gripper: expected 4 finite numbers (x, y, z in m, opening), got {gripper}')
+    for name, value, low, high in zip(('x', 'y', 'z', 'opening'), gripper, GRIPPER_LOW,
+                                      GRIPPER_HIGH):
+        if not low <= value <= high:
+            raise PlanningError(
+                f'gripper: {name} is {value:g}; expected {low:g} to {high:g} (metres from the '
+                'middle of the table, opening 0 to 1)')
+    return Scene(scene.image, gripper, pixels)

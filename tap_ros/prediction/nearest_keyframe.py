@@ -10,7 +10,7 @@ import numpy as np
 from tap_ros.base.errors import ConfigError
 from tap_ros.images.crop import trained_crop
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.prediction.protocol import check_question, Predictor, Question
+from tap_ros.prediction.protocol import check_request, Predictor, Request
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
@@ -23,7 +23,7 @@ class NearestKeyframe(Predictor):
 
     The keyframe is the frame half way from the first picture to the last, by what they show; with
     recursion, of the way to the keyframe before. It is as it was recorded, so that objects are
-    where they were then, not where the question has them.
+    where they were then, not where the request has them.
 
     :param episodes: with at least two frames each, of one picture size.
     :raises ConfigError: if there is none.
@@ -56,17 +56,17 @@ class NearestKeyframe(Predictor):
         store = open_recordings(paths, progress=False)
         return cls(store[i] for i in range(len(store)))
 
-    def predict_together(self, questions: Sequence[Question]) -> list[list[Subgoal]]:
-        """Answer questions, see Predictor; each gets one sample."""
-        return [self._answer(question) for question in questions]
+    def predict_together(self, requests: Sequence[Request]) -> list[list[Subgoal]]:
+        """Answer requests, see Predictor; each gets one sample."""
+        return [self._answer(request) for request in requests]
 
-    def _answer(self, question: Question) -> list[Subgoal]:
-        """Return the keyframes for one question, the earliest first."""
-        pictures, pixels = check_question(question, self.mode, self.image_size)
+    def _answer(self, request: Request) -> list[Subgoal]:
+        """Return the keyframes for one request, the earliest first."""
+        pictures, pixels = check_request(request, self.mode, self.image_size)
         distances = [l1_distance(ends, pictures) for ends in self._ends]  # of start and goal
         episode = self._episodes[int(np.argmin(distances))]
         found, last = [], len(episode) - 1
-        for level in range(1, question.recursion_depth + 1):
+        for level in range(1, request.recursion_depth + 1):
             last = halfway(episode.frames, last)
             places = recorded_places(episode, last, pixels[0])
             maps = one_hot_maps(torch.from_numpy(places), self.image_size).numpy()
@@ -95,13 +95,13 @@ def halfway(frames: np.ndarray, last: int) -> int:
 
 def recorded_places(episode: Episode, t: int, start_pixels: np.ndarray) -> np.ndarray:
     """
-    Return where the objects of a question are in a recorded frame.
+    Return where the objects of a request are in a recorded frame.
 
     Each is taken for the recorded object that began nearest to it; one without such an object, or
     with one whose place is unknown, stays where it is.
 
     :param t: index of the frame.
-    :param start_pixels: (K, 2), (u, v) in the start picture of the question.
+    :param start_pixels: (K, 2), (u, v) in the start picture of the request.
     :return: float32 (K, 2).
     """
     from scipy.optimize import linear_sum_assignment  # takes a moment to import

@@ -120,18 +120,14 @@ def decoder(in_features: int, widths: tuple[int, ...], out_channels: int,
     With the misprint of the paper corrected: 256x4x4, 128x8x8, 64x16x16, 32x32x32, out x64x64.
     The activation of the last block is left to the caller.
     """
-    width = widths[-1]
-    layers: list[nn.Module] = [
-        nn.ConvTranspose2d(in_features, width, coarsest, bias=False), nn.BatchNorm2d(width),
-        nn.ReLU()]
-    for narrower in widths[-2::-1]:
-        layers += [nn.Upsample(scale_factor=2, mode='bilinear', align_corners=False),
-                   nn.Conv2d(width, narrower, 5, padding=2, bias=False),
-                   nn.BatchNorm2d(narrower), nn.ReLU()]
-        width = narrower
-    layers += [nn.Upsample(scale_factor=2, mode='bilinear', align_corners=False),
-               nn.Conv2d(width, out_channels, 5, padding=2)]
-    return nn.Sequential(*layers)
+    layers: list[nn.Module] = [nn.ConvTranspose2d(in_features, widths[-1], coarsest, bias=False)]
+    for wider, narrower in zip(widths[::-1], widths[-2::-1]):
+        layers += [nn.BatchNorm2d(wider), nn.ReLU(), nn.Upsample(scale_factor=2, mode='bilinear'),
+                   nn.Conv2d(wider, narrower, 5, padding=2, bias=False)]
+    return nn.Sequential(
+        *layers, nn.BatchNorm2d(widths[0]), nn.ReLU(),
+        nn.Upsample(scale_factor=2, mode='bilinear'),
+        nn.Conv2d(widths[0], out_channels, 5, padding=2))
 
 
 def initialise(module: nn.Module) -> None:
@@ -205,7 +201,7 @@ def _joined(features: torch.Tensor, batch: int) -> torch.Tensor:
 
 
 def _double(x: torch.Tensor) -> torch.Tensor:
-    return functional.interpolate(x, scale_factor=2, mode='bilinear', align_corners=False)
+    return functional.interpolate(x, scale_factor=2, mode='bilinear')
 
 
 class PredictorNetwork(nn.Module):

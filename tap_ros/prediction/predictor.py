@@ -13,7 +13,7 @@ from tap_ros.images.crop import trained_crop
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
-from tap_ros.prediction.protocol import check_question, Predictor, Question
+from tap_ros.prediction.protocol import check_request, Predictor, Request
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps, WarpedMaps
 from tap_ros.weights import find_predictor
 from tap_ros.weights.devices import placed
@@ -69,56 +69,58 @@ class SubgoalPredictor(Predictor):
         """
         Load a weights file.
 
-        :param path: written by training.
-        :param device: where to run it.
-        :return: SubgoalPredictor.
+        :param path: name of shipped weights, such as 'push2', or a file written by training.
+        :param device: where to run it, 'cpu' or 'cuda'.
+        :return: SubgoalPredictor, with pictures of its image_size.
         :raises WeightsError: if the file is missing, damaged or for something else.
         """
         return cls(*load_network(path, device), source=path)
 
     @torch.inference_mode()
-    def predict_together(self, questions: Sequence[Question]) -> list[list[Subgoal]]:
+    def predict_together(self, requests: Sequence[Request]) -> list[list[Subgoal]]:
         """
-        Answer several questions at once, which takes less time than one after the other.
+        Answer several requests at once, which takes less time than one after the other.
 
         In recursive prediction (section 3.1) each prediction takes the place of the last context
         picture of the next one: of the goal, so that the next one lies between the start and it;
         or, forward, of the start, G(G(c)), so that the next one comes after it. The objects are
         followed through the maps. Each level of each sample has a z of its own; weights without z
-        predict one sample, for all would be the same. Questions with equally many objects go
+        predict one sample, for all would be the same. Requests with equally many objects go
         through the network in one batch, where the last digits of an answer may differ from those
-        of the question alone. Mind the memory: all their samples are held at once.
+        of the request alone. Mind the memory: all their samples are held at once.
 
-        :return: see Predictor.
-        :raises ImageError: likewise; ConfigError: likewise.
+        :param requests: their fields are the arguments of predict.
+        :return: for each what predict returns.
+        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
+        :raises ConfigError: if a count is below 1, or a goal is missing or too much.
         """
-        scenes = [check_question(question, self.mode, self.image_size) for question in questions]
-        alike: dict[int, list[int]] = {}  # number of objects: [index of a question]
+        scenes = [check_request(request, self.mode, self.image_size) for request in requests]
+        alike: dict[int, list[int]] = {}  # number of objects: [index of a request]
         for index, (_, pixels) in enumerate(scenes):
             alike.setdefault(pixels.shape[1], []).append(index)
-        answers: list[list[Subgoal]] = [[] for _ in questions]
+        answers: list[list[Subgoal]] = [[] for _ in requests]
         for chosen in alike.values():
-            chosen.sort(key=lambda index: -questions[index].recursion_depth)
-            found = self._predict([questions[i] for i in chosen], [scenes[i] for i in chosen])
+            chosen.sort(key=lambda index: -requests[index].recursion_depth)
+            found = self._predict([requests[i] for i in chosen], [scenes[i] for i in chosen])
             for index, subgoals in zip(chosen, found):
                 answers[index] = subgoals
         return answers
 
-    def _predict(self, questions: Sequence[Question],
+    def _predict(self, requests: Sequence[Request],
                  scenes: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[list[Subgoal]]:
-        """Answer questions with equally many objects, the deepest recursion first."""
+        """Answer requests with equally many objects, the deepest recursion first."""
         latent_size = self.config.latent_size
-        counts = [question.num_samples if latent_size else 1 for question in questions]
-        generators = [torch.Generator().manual_seed(question.seed) for question in questions]
+        counts = [request.num_samples if latent_size else 1 for request in requests]
+        generators = [torch.Generator().manual_seed(request.seed) for request in requests]
         context = _join([to_float(pictures).to(self._device).expand(N, -1, -1, -1, -1)
                          for N, (pictures, _) in zip(counts, scenes)])
         maps = _join([  # rows, C, K, H, W
             one_hot_maps(torch.from_numpy(pixels).to(self._device), self.image_size).expand(
                 N, -1, -1, -1, -1) for N, (_, pixels) in zip(counts, scenes)])
-        levels: list[list[list[Subgoal]]] = [[] for _ in questions]
-        for level in range(1, max(question.recursion_depth for question in questions) + 1):
+        levels: list[list[list[Subgoal]]] = [[] for _ in requests]
+        for level in range(1, max(request.recursion_depth for request in requests) + 1):
             # Those that go on are the first rows, since the deepest come first.
-            going = sum(question.recursion_depth >= level for question in questions)
+            going = sum(request.recursion_depth >= level for request in requests)
             rows = sum(counts[:going])
             context, maps = context[:rows], maps[:rows]
             z = None
@@ -164,7 +166,7 @@ def _join(parts: list[torch.Tensor]) -> torch.Tensor:
 
 def _to_subgoals(images: torch.Tensor, warped: WarpedMaps, counts: Sequence[int],
                  level: int) -> list[list[Subgoal]]:
-    """Turn the predictions of one level into lists of Subgoal, counts[i] for question i."""
+    """Turn the predictions of one level into lists of Subgoal, counts[i] for request i."""
     images = to_uint8(images)
     maps, mass = warped.maps.cpu().numpy(), warped.mass.cpu().numpy()
     rows = zip(images, maps, expected_pixels(warped.maps).cpu().numpy(), mass)

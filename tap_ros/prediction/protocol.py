@@ -26,7 +26,7 @@ GROUP = 'tap_ros.predictors'
 
 
 @dataclass(frozen=True)
-class Question:
+class Request:
     """
     What a predictor is asked.
 
@@ -63,22 +63,38 @@ class Predictor(Protocol):
     camera_crop: TrainedCrop
     training: Mapping[str, Any]
 
-    def predict_together(self, questions: Sequence[Question]) -> list[list[Subgoal]]:
+    def predict_together(self, requests: Sequence[Request]) -> list[list[Subgoal]]:
         """
-        Answer questions.
+        Answer several requests.
 
-        :return: for each a list of Subgoal: sample after sample, of each its subgoals in a row,
-            earliest first.
-        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
-        :raises ConfigError: if a count is below 1, or a goal is missing or too much.
+        :param requests: their fields are the arguments of predict.
+        :return: for each what predict returns.
+        :raises ImageError: as predict; ConfigError: likewise.
         """
         ...
 
     def predict(self, start: np.ndarray, goal: np.ndarray | None = None,
                 start_pixels: np.ndarray | None = None, goal_pixels: np.ndarray | None = None,
                 num_samples: int = 1, recursion_depth: int = 1, seed: int = 0) -> list[Subgoal]:
-        """Answer one question: the fields of Question; the rest as predict_together."""
-        return self.predict_together([Question(
+        """
+        Predict subgoals.
+
+        :param start: uint8 (H, W, 3) rgb, what is seen now; (H, W) is image_size.
+        :param goal: likewise, what is to be; None in mode 'forward'.
+        :param start_pixels: (K, 2) numbers, (u, v) of each object in the start picture; (0, 0) is
+            the centre of the top-left pixel. None: no objects.
+        :param goal_pixels: likewise, of the same objects in the goal picture; None in mode
+            'forward'.
+        :param num_samples: how many to draw; a predictor without random numbers answers one.
+        :param recursion_depth: how many subgoals in a row, at least 1.
+        :param seed: of what is random; the same arguments give the same answer.
+        :return: list of Subgoal: sample after sample, of each its subgoals in a row, earliest
+            first. Of each `image` uint8 (H, W, 3), `object_maps` float32 (K, H, W) that each sum
+            to 1, and `expected_pixels` float32 (K, 2).
+        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
+        :raises ConfigError: if a count is below 1, or a goal is missing or too much.
+        """
+        return self.predict_together([Request(
             start, goal, start_pixels, goal_pixels, num_samples, recursion_depth, seed)])[0]
 
 
@@ -109,10 +125,10 @@ def predictor_files(text: str) -> list[Path]:
     return [] if text.partition(':')[0] in names(GROUP) else [find_predictor(text)]
 
 
-def check_question(question: Question, mode: str,
+def check_request(request: Request, mode: str,
                    image_size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """
-    Check a question.
+    Check a request.
 
     :param mode: of the predictor; image_size: likewise.
     :return: pictures (C, H, W, 3) and positions (C, K, 2): of the start, and of the goal if the
@@ -120,13 +136,13 @@ def check_question(question: Question, mode: str,
     :raises ImageError: as Predictor.predict_together; ConfigError: likewise.
     """
     for name in ('num_samples', 'recursion_depth'):
-        if getattr(question, name) < 1:
-            raise ConfigError(f'{name}: expected at least 1, got {getattr(question, name)}')
-    start, goal = question.start, question.goal
+        if getattr(request, name) < 1:
+            raise ConfigError(f'{name}: expected at least 1, got {getattr(request, name)}')
+    start, goal = request.start, request.goal
     check_image(start, 'start', image_size)
-    start_pixels = check_pixels(question.start_pixels, 'start_pixels')
+    start_pixels = check_pixels(request.start_pixels, 'start_pixels')
     if mode == 'forward':
-        if goal is not None or question.goal_pixels is not None:
+        if goal is not None or request.goal_pixels is not None:
             raise ConfigError('goal: these weights predict forward, from the start alone; '
                               'leave it out, or use weights for 2 context pictures')
         return start[None], start_pixels[None]
@@ -134,7 +150,7 @@ def check_question(question: Question, mode: str,
         raise ConfigError('goal: these weights predict between a start and a goal picture; '
                           'give one, or use weights for 1 context picture')
     check_image(goal, 'goal', image_size)
-    goal_pixels = check_pixels(question.goal_pixels, 'goal_pixels')
+    goal_pixels = check_pixels(request.goal_pixels, 'goal_pixels')
     if len(start_pixels) != len(goal_pixels):
         raise ImageError(f'goal_pixels: expected {len(start_pixels)} objects as in '
                          f'start_pixels, got {len(goal_pixels)}')

@@ -113,9 +113,7 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
     candidates = [combine(warp(maps, flow), masks)]  # B, K, H, W
     mass = candidates[0].sum((-2, -1))
     if bool((mass < MIN_MASS).any()):
-        candidates.append(combine(warp(blur(maps), flow), masks))
-        candidates.append(combine(maps, masks))
-        candidates.append(maps.mean(1))
+        candidates += [combine(warp(blur(maps), flow), masks), combine(maps, masks), maps.mean(1)]
     warped = candidates[-1]
     for candidate in reversed(candidates[:-1]):
         kept = candidate.sum((-2, -1), keepdim=True) >= MIN_MASS

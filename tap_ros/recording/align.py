@@ -15,13 +15,13 @@ import warnings
 import numpy as np
 from tap_ros.messages.joints import contradicted, PLACE, positions_at
 from tap_ros.messages.stamps import MAX_GAP
-from tap_ros.recording.clocks import put_right
-from tap_ros.recording.columns import Columns, join, NAMES, Track
-from tap_ros.recording.damage import FAR, seconds
+from tap_ros.recording.columns import Columns, NAMES, Track
+from tap_ros.recording.defects import FAR, seconds
 from tap_ros.recording.episode import EpisodeTable, RecordingWarning
 from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
-from tap_ros.recording.spans import assign, find_rounds, in_gaps, MAX_JITTER_NS, read_spans, Span
+from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, Span
+from tap_ros.recording.tracks import read_tracks
 from tap_ros.robots.arm import get_arm, MOST_JOINTS
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
@@ -32,14 +32,12 @@ def runs_of(parts: Iterable[Columns]) -> list[list[Columns]]:
     runs: list[list[Columns]] = []
     newest = shown = -FAR  # log times of any message, and of a frame
     for part in parts:
-        logs = {name: part.arrays[name][:, 0] for name in NAMES if len(part.arrays.get(name, ()))}
-        oldest = min((int(log.min()) for log in logs.values()), default=FAR)
-        first = int(logs['frame'].min()) if 'frame' in logs else FAR
-        if not runs or oldest < newest - MAX_JITTER_NS or first < shown - MIN_MATCH_NS:
+        logs, frames = part.logs(NAMES), part.logs(['frame'])
+        if (not runs or logs.min(initial=FAR) < newest - MAX_JITTER_NS
+                or frames.min(initial=FAR) < shown - MIN_MATCH_NS):
             runs.append([])
         runs[-1].append(part)
-        newest = max((int(log.max()) for log in logs.values()), default=-FAR)
-        shown = int(logs['frame'].max()) if 'frame' in logs else -FAR
+        newest, shown = (int(times.max(initial=-FAR)) for times in (logs, frames))
     return runs
 
 
@@ -53,15 +51,8 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     :param reading: Reading; it says where episodes are cut that no marks tell apart.
     :return: EpisodeTable; episodes without any frame are left out.
     """
-    tracks, names, marks = join(parts)
-    gaps = _gaps(parts)
-    tracks['twist'] = _without_stops(tracks['twist'])
-    shown = tracks['frame']
-    rounds = () if marks else shown.order[find_rounds(shown.stamp, shown.picked()[:, 0])]
-    tracks = put_right(tracks, parts[0].source, parts[0].topics, gaps)
+    tracks, names, gaps, spans = read_tracks(parts, reading)
     frame = tracks['frame']
-    spans = read_spans(frame, tracks['mark'], marks, gaps, reading, parts[0].source,
-                       np.flatnonzero(np.isin(frame.order, rounds)))
     owner = _owner(spans, frame, gaps, parts)
     order = np.lexsort((frame.stamp, owner))
     frame, owner = frame.take(order[owner[order] >= 0]), owner[order[owner[order] >= 0]]
@@ -164,17 +155,6 @@ class _Clock:
         return at[order], found[order]
 
 
-def _gaps(parts: Sequence[Columns]) -> np.ndarray:
-    """Return the gaps of all files, (G, 2); one without a place is behind what came before."""
-    gaps, newest = [np.empty((0, 2), np.int64)], -FAR
-    for part in parts:
-        own = part.arrays.get('gap', gaps[0])
-        gaps.append(np.where(own[:, :1] <= -FAR, newest, own))
-        newest = max([newest, *(int(part.arrays[name][:, 0].max()) for name in NAMES
-                                if len(part.arrays.get(name, ())))])
-    return np.concatenate(gaps)
-
-
 def _owner(spans: list[Span], frame: Track, gaps: np.ndarray,
            parts: Sequence[Columns]) -> np.ndarray:
     """Return (F,) int64: the episode of each frame, -1 for none; count those nobody knows."""
@@ -206,16 +186,6 @@ def _without_repeats(frame: Track, owner: np.ndarray) -> tuple[Track, np.ndarray
     return replace(frame, stamp=stamp), owner
 
 
-def _without_stops(twist: Track) -> Track:
-    """
-    Leave out zero twists without a stamp among stamped ones: they say stop, and answer no frame.
-
-    As the last command before the next frame, such a one would take the place of the action.
-    """
-    stops = (twist.stamp == 0) & ~twist.picked().any(1)
-    return twist.take(np.flatnonzero(~stops)) if twist.stamp.any() else twist
-
-
 def _actions(tracks: dict[str, Track], clock: _Clock) -> np.ndarray:
     """
     Return (F, 4) float32: row t is what was sent between frame t and frame t + 1, the last wins.
@@ -228,12 +198,10 @@ def _actions(tracks: dict[str, Track], clock: _Clock) -> np.ndarray:
     step = np.searchsorted(clock.times, times, 'right') - 1
     with np.errstate(over='ignore'):  # absurd numbers become infinite
         actions[step[step >= 0], :3] = twist.picked(rows[step >= 0])
-        by_log = np.argsort(logs, kind='stable')
         if len(command) and len(logs):
-            step = np.searchsorted(logs[by_log], command.log, 'right') - 1
-            newest = np.full(len(logs), -1)
-            newest[by_log[step[step >= 0]]] = np.flatnonzero(step >= 0)
-            newest = np.maximum.accumulate(newest)
+            by_log = np.argsort(logs, kind='stable')
+            newest = np.empty(len(logs), np.int64)
+            newest[by_log] = np.searchsorted(command.log, np.append(logs[by_log[1:]], FAR)) - 1
             earliest = np.searchsorted(command.log, logs[clock.starts[:-1]])
             known = newest >= earliest[clock.owner]
             actions[known, 3] = command.picked(newest[known])[:, 0]
@@ -307,8 +275,7 @@ def _masks(mask: Track, clock: _Clock,
     A mask belongs to the picture of its own stamp alone: the one before or after shows the robot
     elsewhere, which is worse than none.
     """
-    file = np.full(len(clock.times), -1)
-    row = file.copy()
+    file, row = np.full((2, len(clock.times)), -1)
     times, rows = clock.rows(mask)
     if len(times):
         first = np.minimum(np.searchsorted(times, clock.times), len(times) - 1)
@@ -344,13 +311,7 @@ def _pick_names(tracks: dict[str, Track], clock: _Clock,
 
 def _by_name(rows: np.ndarray, found: np.ndarray, track: Track,
              names: Sequence[tuple[str, ...]], wanted: np.ndarray) -> np.ndarray:
-    """
-    Return (N, K, 9): the values of picked messages with their objects in the wanted order.
-
-    :param rows, found: (N,) row of the message and whether there is one.
-    :param track: the messages.
-    :param names, wanted: tuples by number, as in Columns, and (N,) the number of the wanted names.
-    """
+    """Return (N, K, 9): values of N rows that are found, objects in the order of names[wanted]."""
     most = max((len(names[i]) - 1 for i in np.unique(wanted).tolist()), default=0)
     out = np.full((len(rows), most, 9), np.nan)
     numbers = np.where(found, np.append(track.index, -1)[rows], -1)

@@ -1,82 +1,157 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the bags at a path, their files and their topics; say what is wrong with them."""
+"""Find recordings at a path; say what it holds instead, and the command that helps."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, replace
-import itertools
+from itertools import islice, product
+import os
 from pathlib import Path
-from typing import Any
+import re
+import shlex
+from typing import Any, TypeAlias
 import warnings
 
-from tap_ros.base.errors import ConfigError, ImageError, RecordingError
-from tap_ros.base.text import escaped
-from tap_ros.images.crop import CENTRE, check_trainable, TrainedCrop
-from tap_ros.recording.columns import Columns, first_size
+from mcap.writer import MCAP0_MAGIC as MAGIC
+from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.text import escaped, listing
+from tap_ros.images.crop import CENTRE, TrainedCrop
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.foreign import open_file, recognise
 from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number, natural
 from tap_ros.recording.reading import Reading
-from tap_ros.recording.topic_choice import find_topics, list_paths
+from tap_ros.recording.sqlite_file import beginning, SQLITE
+from tap_ros.recording.topic_choice import Bag, list_paths, total
+
+VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
+_MOST_FILES = 10000  # of a folder that are looked at
+_PACKED = {  # by how a file begins: what it is, and the command that makes it readable
+    b'\x1f\x8b': ('packed by gzip', 'gzip -dk {}'), b'BZh': ('packed by bzip2', 'bzip2 -dk {}'),
+    b'\xfd7zXZ': ('packed by xz', 'xz -dk {}'), b'\4"M\x18': ('packed by lz4', 'lz4 -dk {}'),
+    b'PK\3\4': ('a zip archive', 'unzip {}'),
+    b'version https://git-lfs': ('what Git LFS left in place of the file', 'git lfs pull')}
+Paths: TypeAlias = 'str | Path | Bag | Iterable[str | Path | Bag]'
 
 
-def find_bags(path: str | Path) -> list[list[Path]]:
+def find_bags(paths: Paths) -> list[Bag]:
     """
-    Return the bags at a path: a list of lists of .mcap files, in playing order.
+    Find recordings.
 
-    :param path: .mcap file, bag folder, or folder of bag folders.
-    :raises RecordingError: when there is none.
+    :param paths: one or several .mcap files, bag folders, or folders of bag folders; a Bag stays.
+    :return: list of Bag, in the order of the paths, those of a folder by the numbers in their
+        names. No file is opened yet.
+    :raises RecordingError: where there is none; it says what is there instead.
     """
-    path = Path(path)
-    try:
-        foreign = recognise(path) if path.exists() else None
-        if foreign is not None:
-            return foreign
-        if path.is_file():
-            return [[path]]
-        if not path.is_dir():
-            raise RecordingError(
-                f'{path}: there is no such file or folder' if not path.exists() else
-                f'{path}: neither a regular file nor a folder')
-        folders = [path] if _is_bag(path) else sorted(
-            filter(_is_bag, path.iterdir()), key=natural)
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
-    bags = [files for folder in folders if (files := bag_files(folder))]
-    if not bags:
-        raise RecordingError(
-            f'{path}: holds no recording; expected .mcap files, with {FILE_NAME} beside them, '
-            'or folders of such')
+    bags: list[Bag] = []
+    for path in [paths] if isinstance(paths, (str, os.PathLike, Bag)) else paths:
+        bags += [path] if isinstance(path, Bag) else map(Bag, _find(Path(path)))
     return bags
 
 
-def list_topics(path: str | Path) -> list[tuple[str, str, int | None]]:
+def _find(path: Path) -> list[list[Path]]:
+    """Return the files of each bag at a path, in playing order."""
+    try:
+        if path.is_file():
+            if (path.suffix != '.mcap' and not beginning(path).startswith((MAGIC, SQLITE))
+                    and (why := what_is(path))):
+                raise RecordingError(f'{escaped(path)}: {why}')
+            bags = [[path]]
+        elif not path.is_dir():
+            raise RecordingError(
+                f'{path}: there is no such file or folder' if not path.exists() else
+                f'{path}: neither a regular file nor a folder')
+        elif files := _files(path):
+            bags = [files]
+        else:
+            bags = [files for part in sorted(path.iterdir(), key=natural) if part.is_dir()
+                    and (files := _files(part))]
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
+    if not bags:
+        raise RecordingError(f'{path}: ' + (what_is(path) or (
+            f'holds no recording; expected .mcap files, with {FILE_NAME} beside them, or folders '
+            'of such')))
+    for file in (file for files in bags for file in files):
+        if why := what_else(file):
+            raise RecordingError(f'{file}: {why}')
+    return bags
+
+
+def _files(folder: Path) -> list[Path]:
+    """Return the files of the bag in a folder; none of what is no bag."""
+    found = [file for file in files_by_number(folder, '.db3')
+             if beginning(file).startswith(SQLITE)]
+    if not any(folder.glob('*.mcap*')) and found:
+        return found
+    if found and not (folder / FILE_NAME).exists():  # which says what belongs to the bag
+        raise RecordingError(
+            f'{escaped(folder)}: holds .mcap files and {listing([file.name for file in found])}, '
+            'which are no parts of one bag; give the files one by one, or move those of a bag '
+            'into a folder of its own')
+    return bag_files(folder)
+
+
+def what_is(path: Path) -> str:
+    """Return what something is that is no bag, and the command that makes one; '' if unknown."""
+    for folder in (path, *path.absolute().parents[:4]):
+        if (folder / 'meta' / 'info.json').is_file():
+            return _advice('LeRobot data', 'import-lerobot', folder)
+    if path.name.endswith('.zarr.zip') or any((path / name).is_file() for name in (
+            '.zgroup', '.zarray', '.zattrs', 'zarr.json')):
+        return ('a zarr store, which is not read, as it may hold code; most such sets are on '
+                "LeRobot's hub (hf download lerobot/pusht --repo-type dataset --local-dir pusht),"
+                ' for import-lerobot')
+    for file in (path, *(islice(path.rglob('*'), _MOST_FILES) if path.is_dir() else ())):
+        if '.tfrecord' in file.name:
+            return _advice('TFRecord files, as of RLDS', 'import-tfrecord', path)
+        if file.suffix.lower() in VIDEOS and file.is_file():
+            return _advice('video', 'import-video', path)
+        start = beginning(file)
+        if start.startswith(b'\x89HDF'):
+            return _advice('HDF5, as of ALOHA and robomimic', 'import-arrays', path)
+        if start.startswith(b'#ROSBAG'):
+            whole, bag = (shlex.quote(escaped(one, 400)) for one in (file, file.with_suffix('')))
+            return ('a bag of ROS 1; make one of ROS 2 of it: rosbags-convert --src '
+                    f'{whole} --dst {bag} --dst-storage mcap')
+    return ''
+
+
+def _advice(what: str, command: str, place: Path) -> str:
+    return (f'no recording of ROS, but {what}; make one of it: python -m tap_ros {command} '
+            f'{shlex.quote(escaped(place, 400))} --out BAG')
+
+
+def what_else(path: Path) -> str:
+    """Return why a file cannot be read as it is, and the command that helps; '' if unknown."""
+    start = beginning(path)
+    for magic, (what, command) in _PACKED.items():
+        if start.startswith(magic):
+            if 'packed' in what and re.search(r'[.](tar[.]\w+|tgz)$', path.name):
+                command = 'tar -xf {}'
+            place = shlex.quote(escaped(path, 400))
+            return f'it is {what}; type `{command.format(place)}`'
+    return ''
+
+
+def list_topics(paths: Paths) -> list[tuple[str, str, int | None]]:
     """
     List what recordings hold, whether it can be used or not.
 
-    :param path: .mcap file, bag folder, or folder of bag folders.
+    :param paths: as find_bags takes them.
     :return: (topic, type, number of messages, None where unknown), by name.
     :raises RecordingError: when there is no recording, or nothing of a file can be read.
     """
-    found: dict[tuple[str, str], int | None] = {}
-    for file in (open_file(file) for bag in find_bags(path) for file in bag):
-        file.topics()
-        counts = file.counts()
-        for one in {(channel.topic, channel.type_name) for channel in file.channels.values()}:
-            before, count = found.get(one, 0), counts.get(one)
-            found[one] = None if before is None or count is None else before + count
-    return [(topic, kind, count) for (topic, kind), count in sorted(found.items())]
+    return [(topic, kind, count) for (topic, kind), count in sorted(
+        total(bag.held for bag in find_bags(paths)).items())]
 
 
-def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
-                 image_topic: str = '', trained: TrainedCrop | None = None) -> Reading:
+def reading_like(training: Mapping[str, Any], paths: Paths, image_topic: str = '',
+                 trained: TrainedCrop | None = None) -> Reading:
     """
     Return how recordings are read as those of a training were.
 
     :param training: the training dict of a weights file, of any version; what it does not tell is
         as by default.
-    :param paths: of the recordings.
+    :param paths: of the recordings, as find_bags takes them.
     :param image_topic: the camera's topic; by default that of the training where all of them have
         it, else as topic_choice finds it.
     :param trained: TrainedCrop of the weights; pictures of other cameras are cut as nodes cut
@@ -84,7 +159,7 @@ def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
     :raises RecordingError: when a recording is missing, or nothing of it can be read.
     :raises ImageError: for pictures that cannot be cut as in training; it names the recording.
     """
-    settings = training.get('settings')
+    bags, settings = find_bags(paths), training.get('settings')
     settings = settings if isinstance(settings, dict) else {}
     known = {
         field.name: settings[field.name] for field in fields(Reading)
@@ -93,8 +168,7 @@ def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
     usual = settings.get('image_topic') or ()
     usual = (usual,) if isinstance(usual, str) else tuple(usual)
     topics: str | tuple[str, ...] = image_topic
-    if not image_topic and all(set(usual) <= {topic for topic, _, _ in list_topics(path)}
-                               for path in paths):
+    if usual and not image_topic and all({*usual} <= bag.channels.keys() for bag in bags):
         topics = usual
     try:
         reading = Reading(topics, **known)
@@ -103,72 +177,13 @@ def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
     if trained is None:
         return reading
     cuts = set()
-    for bag, size in _first_sizes(paths, reading):
-        cuts.add(trained.of(size, str(bag)))
-        if why := trained.unlike(size, str(bag)):
-            warnings.warn(escaped(why, 500), RecordingWarning, stacklevel=2)
+    for bag, camera in product(bags, reading.cameras):
+        if size := bag.choose(camera).size:
+            cuts.add(trained.of(size, str(bag.files[0])))
+            if why := trained.unlike(size, str(bag.files[0])):
+                warnings.warn(escaped(why, 500), RecordingWarning, stacklevel=2)
     if len(cuts) > 1 and reading.crop not in ('', CENTRE):
-        raise RecordingError(f'{list_paths(paths)}: some pictures are cut to {reading.crop} '
-                             'already, others are not; score them apart')
+        raise RecordingError(f'{list_paths([bag.files[0] for bag in bags])}: some pictures are '
+                             f'cut to {reading.crop} already, others are not; score them apart')
     cut = cuts.pop() if len(cuts) == 1 else reading.cut
     return replace(reading, crop=cut.part, size=cut.size)
-
-
-def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: str) -> None:
-    """
-    Refuse recordings that no network of ours takes, before they are decoded.
-
-    :param paths: .mcap files, bag folders, or folders of bag folders.
-    :param reading: Reading.
-    :param network: what errors call it.
-    :raises ConfigError: for pictures of a size that it cannot have, see crop.check_trainable, and
-        for one part of pictures of several sizes.
-    :raises RecordingError: when a recording is missing, or lacks the image topic.
-    """
-    sizes = set()
-    for _, size in _first_sizes(paths, reading):
-        sizes.add(size)
-        with suppress(ImageError):  # whoever opens it is told
-            check_trainable(reading.cut.cut_size(size), network)
-    if len(sizes) > 1 and reading.crop not in ('', CENTRE):
-        found = ', '.join('{1}x{0}'.format(*size) for size in sorted(sizes))
-        raise ConfigError(f'recordings: pictures of different sizes, {found}; --crop '
-                          f'{reading.crop} is another part of each, use --crop {CENTRE} or '
-                          'train on them apart')
-
-
-def _first_sizes(paths: Iterable[str | Path],
-                 reading: Reading) -> Iterator[tuple[Path, tuple[int, int]]]:
-    """Yield the first file of each bag, and the (height, width) of a first picture in it."""
-    for bag, camera in itertools.product(
-            (bag for path in paths for bag in find_bags(path)), reading.cameras):
-        size = first_size(bag, next(iter(find_topics(bag, camera))))
-        if size is not None:
-            yield bag[0], size
-
-
-def check_sizes(parts: Sequence[Columns]) -> None:
-    """Refuse recordings whose images differ in size, naming them."""
-    sizes: dict[tuple[int, int], str] = {}
-    for part in parts:
-        if part.image_size is not None:
-            sizes.setdefault(part.image_size, part.source)
-    if not sizes:
-        why = next((f'{part.source}: {part.damage[0]}' for part in parts if part.damage), '')
-        raise RecordingError(
-            f'{list_paths([part.source for part in parts])}: the image topic holds no image'
-            + (f' that can be used; {why}' if why else ''))
-    if len(sizes) > 1:
-        listing = ', '.join(f'{s} ({w}x{h})' for (h, w), s in sizes.items())
-        raise RecordingError(
-            f'images of different sizes (width x height): {listing}; open them separately')
-
-
-def warn_of_damage(part: Columns) -> None:
-    """Say what could not be used of a file, in one warning a cause."""
-    for line in part.damage:
-        warnings.warn(f'{escaped(part.source)}: {line}', RecordingWarning, stacklevel=3)
-
-
-def _is_bag(path: Path) -> bool:
-    return path.is_dir() and bool((path / FILE_NAME).exists() or files_by_number(path))

@@ -8,12 +8,13 @@ its pictures as uint8 arrays, and all else as columns. Any number of processes m
 it at once.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
+from functools import partial
 import hashlib
-import itertools
+from itertools import chain, product
 import json
 import math
 import multiprocessing
@@ -21,24 +22,31 @@ import os
 from pathlib import Path
 import shutil
 import tempfile
+import time
+from typing import Any
+import warnings
 
 import numpy as np
 from safetensors import safe_open, SafetensorError
 from safetensors.numpy import save_file
 from tap_ros.base.engines import run_tasks, Work
-from tap_ros.base.errors import EngineError, RecordingError
+from tap_ros.base.errors import ConfigError, EngineError, ImageError, RecordingError
+from tap_ros.base.text import escaped
+from tap_ros.images.crop import CENTRE, check_trainable
 from tap_ros.recording.align import assemble, runs_of
-from tap_ros.recording.bags import check_sizes, find_bags, warn_of_damage
+from tap_ros.recording.bags import find_bags, Paths
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
-from tap_ros.recording.episode import Episode, EpisodeTable
+from tap_ros.recording.episode import Episode, EpisodeTable, RecordingWarning
+from tap_ros.recording.mcap_file import bytes_of, McapFile
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
-from tap_ros.recording.topic_choice import find_topics, list_paths
+from tap_ros.recording.topic_choice import Bag, list_paths
 from tqdm import tqdm
 
 FORMAT = 9  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
+_SETTLED_NS = 2 * 10**9  # a file changed later may change again and show the same time
 
 
 class EpisodeStore:
@@ -50,6 +58,7 @@ class EpisodeStore:
     :param sources: of each table, the first file of its bag.
     :ivar image_size: (height, width) of the frames.
     :ivar camera_size: likewise, as they were recorded; None where that differs.
+    :ivar cameras: topics of the cameras, sorted.
     :ivar marked: whether marks tell episodes apart, in some of the recordings at least.
     """
 
@@ -61,12 +70,12 @@ class EpisodeStore:
         lengths = [np.diff(table.starts) for table in tables]
         self.lengths = np.concatenate([np.empty(0, np.int64), *lengths])  # (E,) frames
         self.num_frames = int(self.lengths.sum())
-        self.image_size = next(
-            part.image_size for table in tables for part in table.parts if part.image_size)
-        cameras = {part.camera_size for table in tables for part in table.parts
-                   if part.camera_size}
-        self.camera_size = cameras.pop() if len(cameras) == 1 else None
-        self.marked = any(part.marks for table in tables for part in table.parts)
+        parts = [part for table in tables for part in table.parts]
+        self.image_size = next(part.image_size for part in parts if part.image_size)
+        sizes = {part.camera_size for part in parts if part.camera_size}
+        self.camera_size = sizes.pop() if len(sizes) == 1 else None
+        self.cameras = sorted({part.topics['frame'] for part in parts})
+        self.marked = any(part.marks for part in parts)
         self.data_hash = hashlib.sha256(''.join(file_hashes).encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -103,8 +112,8 @@ class EpisodeStore:
         return table.has_masks(local)
 
 
-def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | Path | None = None,
-                    progress: bool = True, reading: Reading = AS_RECORDED) -> EpisodeStore:
+def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress: bool = True,
+                    reading: Reading = AS_RECORDED, network: str = '') -> EpisodeStore:
     """
     Open recordings, decoding what is not in the cache yet.
 
@@ -112,46 +121,53 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     :param cache_dir: by default $TAP_ROS_CACHE or ~/.cache/tap_ros.
     :param progress: show a progress bar when decoding takes long.
     :param reading: Reading: which pictures, which part of them, and where episodes are cut.
+    :param network: what is to learn from them, such as 'the predictor'; pictures of a size that
+        no network of ours takes are then refused before they are decoded.
     :return: EpisodeStore.
     :raises RecordingError: when a recording is missing, empty, damaged or lacks the image topic,
         or when the images differ in size; the message names the file.
+    :raises ConfigError: for sizes that the network cannot take.
     """
-    paths = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
-    found = [bag for path in paths for bag in find_bags(path)]
+    found, cache = find_bags(paths), Path(cache_dir) if cache_dir else cache_folder()
+    bags, cameras = zip(*product(found, reading.cameras))
+    # What each file is, and which topics are read: known from before, or found out.
+    files = list(dict.fromkeys(chain.from_iterable(bag.files for bag in bags)))
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        digests = dict(zip(files, pool.map(partial(_digest, cache), files)))
+    choices = [
+        _remembered(cache, ['topics', camera, *map(digests.__getitem__, bag.files)],
+                    lambda: asdict(bag.choose(camera)))  # noqa: B023  it is called at once
+        for bag, camera in zip(bags, cameras)]
+    for bag, choice in zip(bags, choices):
+        for doubt in choice['doubts']:
+            warnings.warn(f'{bag.source}: {doubt}', RecordingWarning, stacklevel=2)
+    if network:
+        _check_first_sizes({tuple(choice['size']) for choice in choices if choice['size']},
+                           reading, network)
+    # What each file holds: from the cache, or decoded into it.
+    folders = [[_folder(cache, digests[path], choice['topics'], reading) for path in bag.files]
+               for bag, choice in zip(bags, choices)]
+    loaded = _loaded({folder: (bag, number, choice['topics'])
+                      for bag, choice, own in zip(bags, choices, folders)
+                      for number, folder in enumerate(own)}, reading, progress)
+    columns = [[loaded[folder] for folder in own] for own in folders]
+    _check_sizes(list(chain(*columns)))
+    # Episodes of the files that follow each other.
+    arms = [read_mount(bag.files[0].parent) for bag in bags]
     cutting = for_bags(reading, len(found))
-    bags, cameras = zip(*itertools.product(found, reading.cameras))
-    cache_dir = Path(cache_dir) if cache_dir else cache_folder()
-    with tqdm(total=sum(file.stat().st_size for bag in bags for file in bag),
-              desc='decoding once', unit='B', unit_scale=True, disable=not progress,
-              delay=1) as bar:
-        jobs = _jobs(bags, list(map(find_topics, bags, cameras)), reading, cache_dir)
-        loaded = {job: _load(job) for bag in jobs for job in bag}
-        bar.update(sum(job.size for job, part in loaded.items() if part is not None))
-        missing = [job for job, part in loaded.items() if part is None]
-        for job in _built(missing):
-            bar.update(job.size)
-        loaded |= {job: _load(job) for job in missing}
-    unread = next((job.folder for job, part in loaded.items() if part is None), None)
-    if unread is not None:
-        raise RecordingError(f'{unread}: the cache cannot be read back; is the disk full?')
-    columns = [[part for job in bag if (part := loaded[job]) is not None] for bag in jobs]
-    check_sizes([part for bag in columns for part in bag])
-    for part in (part for bag in columns for part in bag):
-        warn_of_damage(part)
-    arms = [read_mount(bag[0].parent) for bag in bags]
-    runs = [(run, arm, bag[0]) for parts, arm, bag in zip(columns, arms, bags)
-            for run in runs_of(parts)]
-    tables = [assemble(run, arm, cutting) for run, arm, _ in runs]
-    # What is read depends on these, too.
-    apart = [repr(arm) for arm in arms if arm != ArmMount()]
+    runs = [(assemble(run, arm, cutting), bag.files[0])
+            for parts, arm, bag in zip(columns, arms, bags) for run in runs_of(parts)]
+    apart: list[Any] = [asdict(arm) for arm in arms if arm != ArmMount()]
     if len(reading.cameras) > 1:
-        apart.append(repr(reading.cameras))
+        apart.append(reading.cameras)
     if replace(reading, image_topic='') != AS_RECORDED:
-        apart.append(repr(replace(reading, image_topic='')))
-    store = EpisodeStore(tables, [*(job.digest for bag in jobs for job in bag), *apart],
-                         [source for _, _, source in runs])
+        apart.append(asdict(reading) | {'image_topic': ''})
+    store = EpisodeStore(
+        [table for table, _ in runs],
+        [*(digests[path] for bag in bags for path in bag.files), *map(json.dumps, apart)],
+        [source for _, source in runs])
     if not len(store):
-        raise RecordingError(f'{list_paths(paths)}: no camera image lies within an episode')
+        raise RecordingError(f'{found[0].source}: no camera image lies within an episode')
     return store
 
 
@@ -160,59 +176,120 @@ def cache_folder() -> Path:
     return Path(os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
 
 
-@dataclass(frozen=True)
-class _Job:
-    """A file to be opened."""
+def _digest(cache: Path, path: Path) -> str:
+    """Return the SHA-256 of a file; of one that was read before and not changed since, as then."""
+    if not path.is_file():
+        bytes_of(path)  # says why it cannot be read
+    parts = [path, *filter(Path.is_file, [path.with_name(f'{path.name}-wal')])]  # of sqlite
 
-    path: Path
-    size: int
-    digest: str
-    found: tuple[tuple[str, str], ...]  # topics and names of their columns
-    reading: Reading
-    folder: Path  # of the cache
-
-
-def _jobs(bags: Sequence[Sequence[Path]], found: Sequence[Mapping[str, str]], reading: Reading,
-          cache_dir: Path) -> list[list[_Job]]:
-    """Return a list of _Job for each bag."""
-    def job(path: Path, names: Mapping[str, str]) -> _Job:
+    def read() -> str:
         with open(path, 'rb') as stream:
             digest = hashlib.file_digest(stream, 'sha256')
-        if (log := path.with_name(f'{path.name}-wal')).is_file():  # of a recorder that was killed
+        for log in parts[1:]:
             digest.update(log.read_bytes())
-        key = hashlib.sha256(json.dumps([
-            FORMAT, sorted(names.items()), reading.crop, reading.size, reading.rate,
-        ]).encode()).hexdigest()[:8]
-        return _Job(path, path.stat().st_size, digest.hexdigest(), tuple(names.items()), reading,
-                    cache_dir / f'{digest.hexdigest()}-{key}')
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        waiting = [[pool.submit(job, path, names) for path in bag]
-                   for bag, names in zip(bags, found, strict=True)]
-        return [[task.result() for task in bag] for bag in waiting]
+        return digest.hexdigest()
+
+    try:
+        stats = [(one.st_size, one.st_ino, one.st_mtime_ns, one.st_ctime_ns)
+                 for one in map(os.stat, parts)]
+        if time.time_ns() - max(max(one[2:]) for one in stats) < _SETTLED_NS:
+            return read()
+        return str(_remembered(cache, ['file', str(path.resolve()), stats], read))
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
 
 
-def _built(jobs: Sequence[_Job]) -> Iterator[_Job]:
+def _remembered(cache: Path, key: list[Any], find: Callable[[], Any]) -> Any:
+    """Return what was found before by a key; else find and keep it. JSON holds both."""
+    path = cache / 'known' / hashlib.sha256(json.dumps([FORMAT, *key]).encode()).hexdigest()
+    with suppress(OSError, ValueError):
+        return json.loads(path.read_text())
+    value = find()
+    with suppress(OSError):  # who decodes into the cache says so
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(value))
+    return value
+
+
+def _check_first_sizes(sizes: set[tuple[int, ...]], reading: Reading, network: str) -> None:
+    """Refuse the (height, width) of first pictures that no network of ours takes."""
+    for size in sizes:
+        with suppress(ImageError):  # whoever cuts them says so
+            check_trainable(reading.cut.cut_size(size), network)
+    if len(sizes) > 1 and reading.crop not in ('', CENTRE):
+        found = ', '.join('{1}x{0}'.format(*size) for size in sorted(sizes))
+        raise ConfigError(f'recordings: pictures of different sizes, {found}; --crop '
+                          f'{reading.crop} is another part of each, use --crop {CENTRE} or '
+                          'train on them apart')
+
+
+def _check_sizes(parts: Sequence[Columns]) -> None:
+    """Refuse recordings whose images differ in size, naming them; warn of what is damaged."""
+    sizes: dict[tuple[int, int], str] = {}
+    for part in parts:
+        if part.image_size is not None:
+            sizes.setdefault(part.image_size, part.source)
+    if not sizes:
+        why = next((f'{part.source}: {part.damage[0]}' for part in parts if part.damage), '')
+        raise RecordingError(
+            f'{list_paths([part.source for part in parts])}: the image topic holds no image'
+            + (f' that can be used; {why}' if why else ''))
+    if len(sizes) > 1:
+        listing = ', '.join(f'{s} ({w}x{h})' for (h, w), s in sizes.items())
+        raise RecordingError(
+            f'images of different sizes (width x height): {listing}; open them separately')
+    for part in parts:
+        for line in part.damage:
+            warnings.warn(f'{escaped(part.source)}: {line}', RecordingWarning, stacklevel=3)
+
+
+def _folder(cache: Path, digest: str, topics: dict[str, str], reading: Reading) -> Path:
+    """Return the folder for a file that is read in one way."""
+    key = json.dumps([FORMAT, sorted(topics.items()), reading.crop, reading.size, reading.rate])
+    return cache / f'{digest}-{hashlib.sha256(key.encode()).hexdigest()[:8]}'
+
+
+def _loaded(wanted: dict[Path, tuple[Bag, int, dict[str, str]]], reading: Reading,
+            progress: bool) -> dict[Path, Columns]:
+    """Return what files of bags hold, by their folder of the cache, decoding what is not there."""
+    found = {folder: _load(folder, bag.files[number])
+             for folder, (bag, number, _) in wanted.items()}
+    works = [Work(str(bag.files[number]), _build, (bag.opened[number], folder, topics, reading))
+             for folder, (bag, number, topics) in wanted.items() if not found[folder]]
+    sizes = [os.stat(work.name).st_size for work in works]
+    with tqdm(total=sum(sizes), desc='decoding once', unit='B', unit_scale=True,
+              disable=not progress, delay=1) as bar:
+        for work in _built(works, together=sum(sizes) > _ALONE_BYTES):
+            folder = work.args[1]
+            found[folder] = _load(folder, Path(work.name))
+            if not found[folder]:
+                raise RecordingError(
+                    f'{folder}: the cache cannot be read back; is the disk full?')
+            bar.update(sizes[works.index(work)])
+    return {folder: part for folder, part in found.items() if part}
+
+
+def _built(works: Sequence[Work], together: bool) -> Iterator[Work]:
     """
-    Decode files into their cache folders; yield the jobs that are done.
+    Decode files into their cache folders; yield the works that are done.
 
     Decoding is Python and holds its lock, so that processes do it where there is much to do.
     """
-    left = list(jobs)
-    if (len(left) > 1 and sum(job.size for job in left) > _ALONE_BYTES
-            and not multiprocessing.current_process().daemon):  # which may not have children
+    left = list(works)
+    if together and len(left) > 1 and not (
+            multiprocessing.current_process().daemon):  # which may not have children
         with suppress(EngineError):  # one cannot import the user's script, or was killed
-            for work, get in run_tasks([Work(str(job.path), _build, (job,)) for job in jobs]):
+            for work, get in run_tasks(works):
                 get()
-                left.remove(work.args[0])
-                yield work.args[0]
-    for job in left:
-        _build(job)
-        yield job
+                left.remove(work)
+                yield work
+    for work in left:
+        work.function(*work.args)
+        yield work
 
 
-def _build(job: _Job) -> None:
+def _build(file: McapFile, folder: Path, topics: dict[str, str], reading: Reading) -> None:
     """Decode a file into its cache folder, which appears complete or not at all."""
-    folder = job.folder
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=folder.name + '.', dir=folder.parent))
@@ -224,40 +301,40 @@ def _build(job: _Job) -> None:
         with ExitStack() as stack:
             streams = {name: stack.enter_context(open(part / name, 'wb')) for name in PICTURES}
             columns = decode_file(
-                job.path, dict(job.found),
-                lambda name, pixels: streams[name].write(pixels.data), job.reading)
+                file, topics, lambda name, pixels: streams[name].write(pixels.data), reading)
+        file.close()
         arrays = {key: np.ascontiguousarray(a) for key, a in columns.arrays.items()}
         save_file(arrays, part / 'columns.safetensors', {'columns': columns.describe()})
-        _put(part, job)
+        _put(part, folder)
     except OSError as error:
         raise RecordingError(f'{folder}: the cache cannot be written: {error}') from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _put(part: Path, job: _Job) -> None:
+def _put(part: Path, folder: Path) -> None:
     """Give a finished folder its name; one that is there stays, unless it cannot be read."""
     try:
-        os.rename(part, job.folder)
+        os.rename(part, folder)
     except OSError:
-        if _load(job) is None:  # else another process was faster
-            shutil.rmtree(job.folder, ignore_errors=True)
-            os.rename(part, job.folder)
+        if _load(folder, folder) is None:  # else another process was faster
+            shutil.rmtree(folder, ignore_errors=True)
+            os.rename(part, folder)
 
 
-def _load(job: _Job) -> Columns | None:
+def _load(folder: Path, source: Path) -> Columns | None:
     """Return the Columns of a cache folder, or None when it is not there or not complete."""
     try:
-        with safe_open(job.folder / 'columns.safetensors', 'numpy') as file:
+        with safe_open(folder / 'columns.safetensors', 'numpy') as file:
             about = json.loads(file.metadata()['columns'])
             arrays = {key: file.get_tensor(key) for key in file.keys()}
         pictures: dict[str, np.ndarray] = {}
         for name, shape in about['shapes'].items():
-            if (job.folder / name).stat().st_size != math.prod(shape):
+            if (folder / name).stat().st_size != math.prod(shape):
                 return None
-            pictures[name] = np.memmap(job.folder / name, np.uint8, 'r', shape=tuple(shape))
+            pictures[name] = np.memmap(folder / name, np.uint8, 'r', shape=tuple(shape))
         sizes = {key: about[key] and tuple(about[key]) for key in ('image_size', 'camera_size')}
-        return Columns(str(job.path), **about | sizes | {
+        return Columns(str(source), **about | sizes | {
             key: [tuple(one) for one in about[key]] for key in ('names', 'marks')},
             pictures=pictures, arrays=arrays)
     except (OSError, SafetensorError, ValueError, LookupError, TypeError):

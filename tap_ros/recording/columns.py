@@ -9,11 +9,10 @@ episode goes on in the next one. A message that cannot be used is left out and n
 
 from array import array
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 import json
-from pathlib import Path
 from typing import Any
 import zlib
 
@@ -26,12 +25,10 @@ from tap_ros.messages.images import decode_image, decode_mask, is_empty
 from tap_ros.messages.joints import decode_positions, PLACE
 from tap_ros.messages.stamps import PROOF, to_nanoseconds
 from tap_ros.messages.topics import BY_COLUMNS, IMAGE
-from tap_ros.recording.damage import describe, FAR, gaps, Loss
-from tap_ros.recording.foreign import open_file
+from tap_ros.recording.defects import Defect, describe, FAR, gaps
 from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.messages import decode
 from tap_ros.recording.reading import Reading
-from tap_ros.recording.spans import Mark
 from tap_ros.recording.views import first_return, look
 from tap_ros.robots.arm import find_joints, known_arms, MOST_JOINTS
 
@@ -43,6 +40,7 @@ _GOALS = ('goal', 'goal_mask', 'goal_object')
 _CUTTING = ('twist', 'command', 'mark')  # without one of them an episode is no longer known
 _NEAR = 8  # pictures
 _MAX_BYTES = 2**20  # of a message that is no picture
+Mark = tuple[str, int, str]  # task, seed, outcome
 
 
 @dataclass
@@ -57,7 +55,7 @@ class Columns:
         joint_values (N, 4) gripper state, NaN where unknown
         arm_values (N, MOST_JOINTS) rad, of an arm where the gripper's place is not told
         object_values, goal_object_values (sum of objects, 9) u, v, pose
-        gap (G, 2) int64: where episodes are cut, as damage.gaps gives it
+        gap (G, 2) int64: where episodes are cut, as defects.gaps gives it
     """
 
     source: str  # what messages call the file
@@ -71,21 +69,50 @@ class Columns:
     shapes: dict[str, list[int]] = field(default_factory=dict)  # of pictures, by name
     topics: dict[str, str] = field(default_factory=dict)  # by name
 
+    def logs(self, names: Iterable[str]) -> np.ndarray:
+        """Return the log times of the messages of some names, (N,) int64."""
+        return np.concatenate([np.empty(0, np.int64), *(
+            self.arrays[name][:, 0] for name in names if name in self.arrays)])
+
     def describe(self) -> str:
         """Return all that is not an array as JSON text."""
         return json.dumps({key: value for key, value in vars(self).items()
                            if key not in ('source', 'pictures', 'arrays')})
 
 
-def decode_file(path: str | Path, found: Mapping[str, str],
+@dataclass
+class Track:
+    """The messages of one name in files that follow each other; N of them."""
+
+    log: np.ndarray  # (N,) int64, ns
+    stamp: np.ndarray  # (N,) int64, ns
+    order: np.ndarray  # (N,) int64: increases as they were written, over all names
+    index: np.ndarray  # (N,) int64, see Columns
+    file: np.ndarray  # (N,) int64, index into the parts
+    first: np.ndarray  # (N,) int64, row of values, the first of several objects
+    values: np.ndarray  # (M, width) float64
+
+    def __len__(self) -> int:
+        return len(self.log)
+
+    def take(self, rows: np.ndarray) -> 'Track':
+        """Return some of the messages."""
+        return Track(self.log[rows], self.stamp[rows], self.order[rows], self.index[rows],
+                     self.file[rows], self.first[rows], self.values)
+
+    def picked(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Return the values of some messages, (N, width)."""
+        return self.values[self.first[rows]]
+
+
+def decode_file(file: McapFile, found: Mapping[str, str],
                 write: Callable[[str, np.ndarray], object], reading: Reading) -> Columns:
     """
     Read a file from front to back.
 
     Pictures of another size than the first one are left out, as are those that cannot be used.
 
-    :param path: of the file.
-    :param found: dict from the file's topics to names of columns, as topics.resolve gives it.
+    :param found: names of columns by topic, the camera's first, see topic_choice.Choice.
     :param write: called with the name, one of PICTURES, and the pixels of one picture after the
         other, uint8, in the order of the file; they are not to be kept.
     :param reading: Reading; pictures, masks and pixels are cut and scaled as it says.
@@ -93,33 +120,25 @@ def decode_file(path: str | Path, found: Mapping[str, str],
     :raises RecordingError: when no more than half of the pictures are of that size, or they are of
         several cameras by their headers; it names the file.
     """
-    first = next((first_size([path], topic) for topic in found if found[topic] == 'frame'), None)
-    decoder = _Decoder(open_file(path), found, write, first, reading)
+    decoder = _Decoder(file, found, write, reading)
     try:
-        for channel, log, _, data in decoder.file.messages(found):
+        for channel, log, _, data in file.messages(found):
             if channel.type_name in BY_COLUMNS[found[channel.topic]].types:
                 decoder.take(channel.topic, channel.type_name, log, data)
         decoder.check_sizes()
         decoder.check_cameras()
     except RecordingError as error:
-        raise RecordingError(f'{path}: {error}') from error
+        raise RecordingError(f'{file.path}: {error}') from error
     return decoder.finish()
 
 
-def first_size(paths: Iterable[str | Path], topic: str) -> tuple[int, int] | None:
-    """
-    Return (height, width) of the first picture of files, before it is cut; None without any.
-
-    :param paths: of the files.
-    :param topic: the camera's.
-    :raises RecordingError: when nothing can be read.
-    """
-    for file in map(open_file, paths):
-        for channel, *_, data in file.messages({topic}):
-            if channel.type_name in IMAGE.types:
-                with suppress(RecordingError, ImageError):
-                    height, width, _ = decode_image(decode(channel.type_name, data)).shape
-                    return height, width
+def first_size(file: McapFile, topic: str) -> tuple[int, int] | None:
+    """Return (height, width) of the first picture of a topic, before it is cut; None: of none."""
+    for channel, *_, data in file.messages({topic}):
+        if channel.type_name in IMAGE.types:
+            with suppress(RecordingError, ImageError):
+                height, width, _ = decode_image(decode(channel.type_name, data)).shape
+                return height, width
     return None
 
 
@@ -127,15 +146,14 @@ class _Decoder:
     """Collects the columns of a file message by message; pictures are passed on at once."""
 
     def __init__(self, file: McapFile, found: Mapping[str, str],
-                 write: Callable[[str, np.ndarray], object], first: tuple[int, int] | None,
-                 reading: Reading) -> None:
+                 write: Callable[[str, np.ndarray], object], reading: Reading) -> None:
         self.file, self.found, self.write, self.reading = file, found, write, reading
-        self.first = first  # (H, W) of the first camera image
+        self.first = first_size(file, next(iter(found)))  # (H, W) of the first camera image
         self.size: tuple[int, int] | None = None  # that pictures must have, by _alike
         self.columns = Columns(
             str(file.path), topics={name: topic for topic, name in found.items()})
         self.sizes: Counter[tuple[int, int]] = Counter()  # (H, W) -> camera images
-        self.losses: list[Loss] = []
+        self.defects: list[Defect] = []
         self.order = 0  # messages so far
         self.rows: defaultdict[str, array[int]] = defaultdict(lambda: array('q'))
         self.values: defaultdict[str, array[float]] = defaultdict(lambda: array('d'))
@@ -162,8 +180,8 @@ class _Decoder:
                 raise RecordingError(f'a message of more than {_MAX_BYTES} bytes')
             self.decoders[name](name, log, decode(kind, data))
         except (RecordingError, ImageError) as error:
-            self.losses.append(
-                Loss(str(error), f'topic {topic}', None, log, log, name in _CUTTING))
+            self.defects.append(
+                Defect(str(error), f'topic {topic}', None, log, log, name in _CUTTING))
             if name in _GOALS:  # what was said before holds no more
                 self._add(name, log, 0, self._number(('',)) if name == 'goal_object' else -1)
 
@@ -203,9 +221,9 @@ class _Decoder:
                 pixels = columns.arrays[f'{name}_values'][:, :2]
                 with np.errstate(over='ignore'):  # absurd numbers become infinite
                     pixels[:] = cut.pixels(pixels.astype(np.float32), columns.camera_size)
-        losses = self.file.losses + self.losses
-        if losses:
-            columns.damage, columns.arrays['gap'] = describe(losses), gaps(losses)
+        defects = self.file.defects + self.defects
+        if defects:
+            columns.damage, columns.arrays['gap'] = describe(defects), gaps(defects)
         if (first := first_return(self.looks)) is not None:
             columns.damage.append(
                 f'topic {escaped(columns.topics["frame"])}: from picture {first} on two views '
@@ -311,54 +329,3 @@ class _Decoder:
     def _mark(self, name: str, log: int, message: Any) -> None:
         self._add(name, log, to_nanoseconds(message.header.stamp), message.event)
         self.columns.marks.append((message.task, message.seed, message.outcome))
-
-
-@dataclass
-class Track:
-    """The messages of one name in files that follow each other; N of them."""
-
-    log: np.ndarray  # (N,) int64, ns
-    stamp: np.ndarray  # (N,) int64, ns
-    order: np.ndarray  # (N,) int64: increases as they were written, over all names
-    index: np.ndarray  # (N,) int64, see Columns
-    file: np.ndarray  # (N,) int64, index into the parts
-    first: np.ndarray  # (N,) int64, row of values, the first of several objects
-    values: np.ndarray  # (M, width) float64
-
-    def __len__(self) -> int:
-        return len(self.log)
-
-    def take(self, rows: np.ndarray) -> 'Track':
-        """Return some of the messages."""
-        return Track(self.log[rows], self.stamp[rows], self.order[rows], self.index[rows],
-                     self.file[rows], self.first[rows], self.values)
-
-    def picked(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Return the values of some messages, (N, width)."""
-        return self.values[self.first[rows]]
-
-
-def join(parts: Sequence[Columns]) -> tuple[dict[str, Track], list[tuple[str, ...]], list[Mark]]:
-    """Put the columns of several files one behind the other; return names and marks, too."""
-    numbers: dict[tuple[str, ...], int] = {}
-    tracks = {}
-    for part in parts:
-        for names in part.names:
-            numbers.setdefault(tuple(names), len(numbers))
-    counts = np.array([len(names) - 1 for names in numbers], np.int64)
-    for name in NAMES:
-        rows, values = [np.empty((0, 5), np.int64)], [np.empty((0, WIDTHS.get(name, 1)))]
-        for file, part in enumerate(parts):
-            found = part.arrays.get(name, np.empty((0, 4), np.int64)).copy()
-            found[:, 2] += file << 40  # later files are behind earlier ones
-            if 'object' in name:
-                local = np.array([numbers[tuple(n)] for n in part.names], np.int64)
-                found[:, 3] = local[found[:, 3]]
-            rows.append(np.insert(found, 4, file, axis=1))
-            values.append(part.arrays.get(f'{name}_values', values[0]))
-        log, stamp, order, index, owner = np.concatenate(rows).T
-        lengths = counts[index] if 'object' in name else np.ones(len(log), np.int64)
-        tracks[name] = Track(log, stamp, order, index, owner, np.cumsum(lengths) - lengths,
-                             np.concatenate(values))
-    return tracks, list(numbers), [mark for part in parts for mark in part.marks]
-

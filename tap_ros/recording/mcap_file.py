@@ -5,17 +5,20 @@ MCAP files, read front to back past damage, by the records of the mcap package.
 
 mcap's own readers end at the first record that they do not understand. Here chunks are read where
 the summary lists them; without a summary the records are read one after the other, so that all
-that a killed recorder wrote completely is used. What cannot be used is noted as a loss.
+that a killed recorder wrote completely is used. What cannot be used is noted as a defect.
 """
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
 from itertools import chain
-from mmap import mmap
+import mmap
+import os
 from pathlib import Path
+import stat
 import struct
 from typing import Any
 import zlib
@@ -31,8 +34,7 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.base.contract import MAX_PICTURE_BYTES
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.text import escaped
-from tap_ros.recording.damage import FAR, Loss
-from tap_ros.recording.file_bytes import bytes_of, what_else
+from tap_ros.recording.defects import Defect, FAR
 from tap_ros.recording.trust import Budget
 import zstandard
 
@@ -60,64 +62,70 @@ class Channel:
 
 class McapFile:
     """
-    An MCAP file to be read once from front to back.
+    An MCAP file, opened once and read from front to back as often as is needed.
 
     :param path: of the file.
     :ivar channels: by number; grows while messages are read.
-    :ivar losses: what could not be used; complete when all messages are read.
+    :ivar summary: what the end of the file says that it holds; empty where that is damaged.
+    :ivar defects: what could not be used; complete when all messages are read.
     :raises RecordingError: when it is missing, empty, no regular file, or not MCAP.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = path
-        self._data = bytes_of(path)
-        self._budget = Budget(len(self._data))
+        self._size = len(self._data)
         if self._data[:len(MAGIC)] != MAGIC:
-            why = what_else(Path(path)) or (
-                f'not an MCAP file: it starts with {self._data[:8].hex(" ")}, not '
-                f'{MAGIC.hex(" ")}')
-            raise RecordingError(f'{path}: {why}')
+            raise RecordingError(f'{path}: not an MCAP file: it starts with '
+                                 f'{self._data[:8].hex(" ")}, not {MAGIC.hex(" ")}')
         self.channels: dict[int, Channel] = {}
-        self.losses: list[Loss] = []
+        self.defects: list[Defect] = []
         self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, text
         self._newest: int | None = None  # log time so far
         self._counts: Counter[int] = Counter()  # messages read by channel
         self._is_read = False  # to the end
         self._needs_summary = True  # as its end says that there is one, or is not there
         self._stopped: int | None = None  # the byte from which on records are not understood
-        self._summary = self._find_summary()
-        self._scan([*self._summary.schemas.values(), *self._summary.channels.values()])
-        if not all(known.type_name for known in self.channels.values()):
-            self.channels = {}  # the summary has channels without their types
-
-    def topics(self) -> dict[str, Channel]:
-        """
-        Return what the file holds, by topic.
-
-        Takes it from the summary; a file that has none is read through.
-        """
-        if not self.channels:
+        self.summary = self._find_summary()
+        self._scan([*self.summary.schemas.values(), *self.summary.channels.values()])
+        if not self.channels or not all(one.type_name for one in self.channels.values()):
+            self.channels, self.summary.chunk_indexes = {}, []  # the summary does not tell types
             for _ in self.messages(()):
                 pass
-        return {channel.topic: channel for channel in self.channels.values()}
+        self.close()
 
-    def counts(self) -> Counter[tuple[str, str]]:
-        """Return the number of messages by topic and type; empty where nothing tells it."""
-        found, statistics = Counter[tuple[str, str]](), self._summary.statistics
+    @cached_property
+    def _data(self) -> bytes | mmap.mmap:
+        return bytes_of(self.path)
+
+    def close(self) -> None:
+        """Let go of the bytes, of which there may be many; what is read next maps them again."""
+        vars(self).pop('_data', None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Let another process go on with what is known."""
+        return {name: value for name, value in vars(self).items() if name != '_data'}
+
+    def counts(self) -> dict[tuple[str, str], int | None]:
+        """Return the number of messages by topic and type; None where nothing tells it."""
+        statistics, found = self.summary.statistics, dict[tuple[str, str], int | None]()
         counts = statistics.channel_message_counts if statistics else self._counts
-        for number, channel in self.channels.items() if statistics or self._is_read else ():
-            found[channel.topic, channel.type_name] += counts.get(number, 0)
+        for number, channel in self.channels.items():
+            key = channel.topic, channel.type_name
+            found[key] = (found.get(key) or 0) + counts.get(number, 0) if (
+                statistics or self._is_read) else None
         return found
 
     def messages(self, wanted: Collection[str]) -> Iterator[tuple[Channel, int, int, memoryview]]:
         """
         Yield the messages of some topics in the order of the file.
 
-        What cannot be read is left out, chunk by chunk; `losses` says what it is.
+        What cannot be read is left out, chunk by chunk; `defects` says what it is.
 
         :param wanted: the topics.
         :return: iterator over (channel, log time and publish time in ns, data).
         """
+        self.defects, self._budget = [], Budget(self._size)
+        self._newest = self._stopped = None
         for number, log, publish, data in chain.from_iterable(self._blocks()):
             channel = self.channels.get(number)
             if channel is None or channel.topic not in wanted:
@@ -137,10 +145,11 @@ class McapFile:
 
     def _blocks(self) -> Iterator[list[Found]]:
         """Yield the messages of the file, block by block."""
-        if self._summary.chunk_indexes and self.channels:
-            entries = {entry.chunk_start_offset: entry for entry in self._summary.chunk_indexes}
+        self._counts.clear()
+        if self.summary.chunk_indexes:
+            entries = {entry.chunk_start_offset: entry for entry in self.summary.chunk_indexes}
             starts = sorted(entries)
-            for start, behind in zip(starts, [*starts[1:], len(self._data)]):
+            for start, behind in zip(starts, [*starts[1:], self._size]):
                 yield self._unpacked(start, entries[start], behind)
             return
         for start, record in self._in_order():
@@ -151,7 +160,7 @@ class McapFile:
 
     def _find_summary(self) -> Summary:
         """Return what the end of the file says it holds; nothing, where that cannot be used."""
-        summary, footer = Summary(), len(self._data) - _FOOTER.size - len(MAGIC)
+        summary, footer = Summary(), self._size - _FOOTER.size - len(MAGIC)
         if footer < len(MAGIC) or self._data[-len(MAGIC):] != MAGIC:
             return summary
         kind, length, start, _, crc = _FOOTER.unpack_from(self._data, footer)
@@ -178,7 +187,7 @@ class McapFile:
 
     def _in_order(self) -> Iterator[tuple[int, McapRecord]]:
         """Yield (byte, record) of the records before the summary; note where they stop."""
-        stream: Any = self._data if isinstance(self._data, mmap) else BytesIO(self._data)
+        stream: Any = self._data if isinstance(self._data, mmap.mmap) else BytesIO(self._data)
         stream.seek(0)
         records, start = StreamReader(stream, emit_chunks=True).records, len(MAGIC)
         with suppress(*_DAMAGE):
@@ -204,11 +213,7 @@ class McapFile:
                 _unpack(name, self._data[start + stream.count:], size), self._budget)
 
     def _unpacked(self, start: int, chunk: Chunk | ChunkIndex, behind: int = 0) -> list[Found]:
-        """
-        Return the messages of a chunk, or of what the summary says of one, at a byte.
-
-        :param behind: where the summary says that the next one begins.
-        """
+        """Return the messages of a chunk at a byte; its summary says where the next begins."""
         first, last = (min(time, FAR) for time in (
             chunk.message_start_time, chunk.message_end_time))
         try:
@@ -229,7 +234,7 @@ class McapFile:
                 raise ValueError('its CRC does not match')
             return self._scan(list(_split(data, self._budget)))
         except _DAMAGE as error:
-            self.losses.append(Loss(f'it is damaged, restore the file from a copy: {error}',
+            self.defects.append(Defect(f'it is damaged, restore the file from a copy: {error}',
                                     'chunk', start, first, last))
             return []
 
@@ -251,18 +256,18 @@ class McapFile:
                 self.channels[record.id] = Channel(
                     record.topic, name, record.message_encoding, encoding, text)
         self._counts.update(number for number, *_ in found)
-        times = [min(log, FAR) for _, log, *_ in found]
-        if times:
-            self._newest = max(times) if self._newest is None else max(*times, self._newest)
+        if found:
+            newest = min(max(log for _, log, *_ in found), FAR)
+            self._newest = newest if self._newest is None else max(newest, self._newest)
         for number in {number for number, *_ in found} - self.channels.keys():
-            logs = [log for log, message in zip(times, found) if message[0] == number]
-            self.losses.append(Loss(f'messages of channel {number}, which nothing describes',
+            logs = [min(log, FAR) for own, log, *_ in found if own == number]
+            self.defects.append(Defect(f'messages of channel {number}, which nothing describes',
                                     'block', None, min(logs), max(logs)))
         return found
 
     def _conclude(self, wanted: Collection[str]) -> None:
         """Compare what was read with what the end of the file says."""
-        statistics, end = self._summary.statistics, self._newest
+        statistics, end = self.summary.statistics, self._newest
         lines = [
             f'{count - self._counts[number]} of {count} of topic '
             f'{escaped(self.channels[number].topic)}' for number, count in (
@@ -270,14 +275,14 @@ class McapFile:
             if count > self._counts[number]
             and number in self.channels and self.channels[number].topic in wanted]
         if lines:
-            self.losses.append(Loss(f'messages are missing: {", ".join(lines)}', cuts=False))
+            self.defects.append(Defect(f'messages are missing: {", ".join(lines)}', cuts=False))
         if self._stopped is not None:
-            self.losses.append(Loss(
-                f'the file is cut off at byte {self._stopped} of {len(self._data)}; '
+            self.defects.append(Defect(
+                f'the file is cut off at byte {self._stopped} of {self._size}; '
                 'what is whole before that is used; copy it again if it was cut by copying',
                 start=None if end is None else end + 1, end=end))
         elif self._needs_summary:
-            self.losses.append(Loss('its summary is damaged, so that nothing tells whether all '
+            self.defects.append(Defect('its summary is damaged, so that nothing tells whether all '
                                     'messages are there', cuts=False))
 
 
@@ -308,3 +313,37 @@ def _split(data: bytes | memoryview, budget: Budget) -> Iterator[McapRecord | Fo
         elif kind in (Opcode.SCHEMA, Opcode.CHANNEL):
             yield (Schema if kind == Opcode.SCHEMA else ChannelRecord).read(
                 ReadDataStream(BytesIO(view[start:at])))
+
+
+def bytes_of(path: str | Path) -> bytes | mmap.mmap:
+    """
+    Map a file into memory; one that was packed as a whole is unpacked there.
+
+    :raises RecordingError: when it is missing, empty, no regular file, or does not unpack.
+    """
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a FIFO would wait for its writer
+            raise RecordingError(f'{path}: not a regular file; expected an .mcap file')
+        with open(path, 'rb') as stream:
+            start = stream.read(4)
+            if start == zstandard.FRAME_HEADER:
+                stream.seek(0)
+                pieces, budget = [], Budget(os.fstat(stream.fileno()).st_size)
+                reader = zstandard.ZstdDecompressor().stream_reader(
+                    stream, read_across_frames=True)
+                while piece := reader.read(2**20):
+                    budget.take(len(piece))
+                    pieces.append(piece)
+                data = b''.join(pieces)
+                if not data:
+                    raise RecordingError(f'{path}: does not unpack: it is cut short')
+            elif start:
+                data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
+    except (ValueError, zstandard.ZstdError, MemoryError) as error:
+        raise RecordingError(f'{escaped(path)}: does not unpack: {escaped(error)}; unpack it with '
+                             'zstd -d') from error
+    if not start:
+        raise RecordingError(f'{path}: the file is empty; it holds no message')
+    return data

@@ -165,14 +165,6 @@ def check_schema(type_name: str, text: str) -> None:
                 f'message type {name}: recorded with the fields {theirs}; expected {ours}')
 
 
-def _references(types: dict[str, Any]) -> set[str]:
-    """Return the types that the fields of definitions name."""
-    parts = [part for _, fields in types.values() for _, part in fields]
-    return {detail for kind, detail in (
-        detail[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, detail)
-        for kind, detail in parts) if kind == Nodetype.NAME}
-
-
 def _look_up(type_name: str) -> None:
     """Read definitions that rosbags does not know from the ROS installation."""
     found: dict[str, Any] = {}
@@ -181,7 +173,10 @@ def _look_up(type_name: str) -> None:
         name = waiting.pop()
         if name in store.fielddefs or name in found:
             continue
-        path = _find_in_ros(name)
+        package, _, kind = name.partition('/msg/')
+        places = (Path(prefix, 'share', package, 'msg', f'{kind}.msg') for prefix in filter(
+            None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)))
+        path = next(filter(Path.is_file, places), None)
         if path is None:
             raise RecordingError(
                 f'message type {name}: no definition found; built in are those of ROS 2 Jazzy '
@@ -191,19 +186,13 @@ def _look_up(type_name: str) -> None:
             found |= get_types_from_msg(path.read_text(), name)
         except _UNREADABLE as error:
             raise RecordingError(f'message type {name}: {path} cannot be read') from error
-        waiting += _references({name: found[name]})
+        for _, part in found[name][1]:  # what its fields are of, or arrays of
+            kind, detail = part[1][0] if part[0] in (
+                Nodetype.ARRAY, Nodetype.SEQUENCE) else part
+            if kind == Nodetype.NAME:
+                waiting.append(detail)
     if found:
         store.register(found)
-
-
-def _find_in_ros(type_name: str) -> Path | None:
-    """Return the path of a definition in the ROS installation, or None."""
-    package, _, name = type_name.partition('/msg/')
-    for prefix in filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)):
-        path = Path(prefix, 'share', package, 'msg', f'{name}.msg')
-        if path.is_file():
-            return path
-    return None
 
 
 def _build(type_name: str, values: dict[str, Any]) -> Any:

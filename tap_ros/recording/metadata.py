@@ -17,12 +17,12 @@ from typing import Any
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.text import escaped, listing
-from tap_ros.recording.file_bytes import PACKED, unpacked_name
 from tap_ros.recording.trust import parse_json, read_bytes
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
 import yaml
 
 FILE_NAME, MOUNT_NAME = 'metadata.yaml', 'arm_mount.json'
+PACKED = '.zstd', '.zst'  # behind the name of a file that was compressed as a whole
 MAX_BYTES = 2**23  # of metadata.yaml
 DEEPEST = 50  # levels of it; rosbag2 writes 8
 LONGEST = 2**16  # characters of a word without quotes
@@ -121,10 +121,10 @@ def natural(path: Path) -> list[int | str]:
     return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', str(path))]
 
 
-def files_by_number(folder: str | Path) -> list[Path]:
-    """Return the .mcap files of a folder in the order of the numbers in their names."""
-    found = {unpacked_name(path): path for end in (*PACKED, '')
-             for path in Path(folder).glob(f'*.mcap{end}')}
+def files_by_number(folder: str | Path, ending: str = '.mcap') -> list[Path]:
+    """Return the files of a storage in a folder in the order of the numbers in their names."""
+    found = {path.stem if path.suffix in PACKED else path.name: path
+             for end in (*PACKED, '') for path in Path(folder).glob(f'*{ending}{end}')}
     return sorted(found.values(), key=natural)
 
 

@@ -14,20 +14,15 @@ end they are left out.
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 import warnings
 
 import numpy as np
-from tap_ros.recording.damage import FAR
+from tap_ros.recording.columns import Mark, Track
+from tap_ros.recording.defects import FAR
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.reading import Reading
-
-if TYPE_CHECKING:
-    from tap_ros.recording.columns import Track
-
-Mark = tuple[str, int, str]  # task, seed, outcome
 
 MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
 _LATE_NS = 5 * 10**9  # likewise where stamps alone tell episodes apart, as no clock begins anew
@@ -49,19 +44,20 @@ class Span:
     outcome: str | None = ''  # None: of frames that may belong to no episode
 
 
-def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.ndarray,
-               reading: Reading, source: str, rounds: np.ndarray) -> list[Span]:
+def read_spans(tracks: Mapping[str, Track], marks: Sequence[Mark], gaps: np.ndarray,
+               rounds: np.ndarray, reading: Reading, source: str) -> list[Span]:
     """
     Read the marks: a list of spans in the order of the log.
 
-    :param frame, mark: sorted by log time.
+    :param tracks: by name, sorted by log time.
     :param marks: (task, seed, outcome) of each mark, by its row of values.
-    :param gaps: (G, 2) as damage.gaps.
+    :param gaps: (G, 2) as defects.gaps.
+    :param rounds: rows of frames that begin a round, see find_rounds.
     :param reading: Reading; without marks, a longer pause than its gap between two frames begins
         an episode; without pauses, longer episodes than it says are cut into equal parts.
     :param source: what warnings call the recording.
-    :param rounds: rows of frames that begin a round, see find_rounds.
     """
+    frame = tracks['frame']
     pauses = frame.stamp[rounds] - frame.stamp[rounds - 1]
     if count := int((pauses <= (reading.gap or np.inf) * 1e9).sum()):
         warnings.warn(
@@ -70,7 +66,7 @@ def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.nd
     if not marks and reading.gap:
         _propose_gap(frame.stamp, reading, source)
     places = gaps[np.argsort(gaps[:, 0], kind='stable')].tolist()
-    spans = _marked(mark, marks, places) if marks else _unmarked(
+    spans = _marked(tracks['mark'], marks, places) if marks else _unmarked(
         frame.log, frame.stamp, rounds, int(reading.gap * 1e9), int(reading.episode_seconds * 1e9))
     if places:
         spans = [part for span in spans for part in _cut(span, places)]
@@ -82,7 +78,7 @@ def in_gaps(gaps: np.ndarray, log: np.ndarray) -> np.ndarray:
     """
     Tell which times lie where messages of any topic may be missing, ends included.
 
-    :param gaps: (G, 2) int64, as damage.gaps gives it.
+    :param gaps: (G, 2) int64, as defects.gaps gives it.
     :param log: (N,) int64, ns.
     :return: (N,) bool.
     """
@@ -92,7 +88,7 @@ def in_gaps(gaps: np.ndarray, log: np.ndarray) -> np.ndarray:
     return log <= ends[before]
 
 
-def _marked(mark: 'Track', marks: Sequence[Mark], gaps: list[list[int]]) -> list[Span]:
+def _marked(mark: Track, marks: Sequence[Mark], gaps: list[list[int]]) -> list[Span]:
     """Return the spans between marks; where marks may be lost nothing is known until the next."""
     # At the same time starts come before gaps and ends behind: what cannot be told is left out.
     events: list[tuple[int, int, int, int, Mark]] = [
@@ -127,20 +123,13 @@ def _marked(mark: 'Track', marks: Sequence[Mark], gaps: list[list[int]]) -> list
     return spans
 
 
-def find_rounds(stamps: np.ndarray, checksums: np.ndarray) -> np.ndarray:
+def find_rounds(checksums: np.ndarray) -> np.ndarray:
     """
     Find where a playback that was recorded began anew.
 
-    :param stamps, checksums: (N,) of the pictures, in the order in which they were written.
+    :param checksums: (N,) of the pictures, in the order in which they were written.
     :return: rows from which on pictures are as before, in their order: (R,) int64.
     """
-    count = len(np.unique(checksums))
-    if len(checksums) - count < _ROUND:
-        return np.empty(0, np.int64)
-    back = np.flatnonzero(np.diff(stamps) < -MAX_JITTER_NS) + 1
-    pairs = np.unique(np.stack([stamps, checksums], 1), axis=0)
-    if len(back) and len(pairs) <= len(stamps) - _ROUND:  # the same pictures with their stamps
-        return back
     places: dict[float, int] = {}  # in its round, by checksum
     at, known, place = [], [], -1
     for checksum in checksums.tolist():
@@ -201,7 +190,7 @@ def _cut(span: Span, gaps: list[list[int]]) -> Iterator[Span]:
     yield span
 
 
-def assign(spans: Sequence[Span], track: 'Track') -> np.ndarray:
+def assign(spans: Sequence[Span], track: Track) -> np.ndarray:
     """Return (N,) int64: the episode of each message, -1 for none."""
     log, stamps = track.log, track.stamp
     start_log, end_log, start_stamp, end_stamp = np.array(

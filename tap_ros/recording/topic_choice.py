@@ -7,14 +7,13 @@ By what is needed: by type, name and namespace, by the number of messages and, w
 do, by what is in them. Only where two cameras are left is somebody asked.
 """
 
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any
-import warnings
+from typing import Any, TypeAlias
 
 import numpy as np
 from tap_ros.base.contract import GRIPPER_JOINTS
@@ -23,13 +22,15 @@ from tap_ros.base.text import escaped, listing
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import decode_positions, PLACE
 from tap_ros.messages.topics import BY_COLUMNS, IMAGE, JOINT_STATES, Topic, TOPICS
-from tap_ros.recording.damage import describe
-from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.foreign import explain, open_file
-from tap_ros.recording.mcap_file import Channel
+from tap_ros.recording.columns import first_size
+from tap_ros.recording.defects import describe
+from tap_ros.recording.mcap_file import Channel, McapFile
 from tap_ros.recording.messages import check_schema, decode
+from tap_ros.recording.sqlite_file import open_file
 from tap_ros.robots.arm import find_joints, known_arms
 
+_PACKETS = 'FFMPEGPacket', 'CompressedVideo', 'theora_image_transport/msg/Packet'  # types
+Counts: TypeAlias = dict[tuple[str, str], int | None]  # by topic and type
 _LOOKED_AT = 5  # messages, as the first may be damaged
 _FEW = 20  # of a picture topic are so many times fewer than of a camera
 
@@ -39,66 +40,117 @@ def list_paths(paths: Sequence[str | Path]) -> str:
     return str(paths[0]) + (f' and {len(paths) - 1} more' if len(paths) > 1 else '')
 
 
-def find_topics(files: Sequence[Path], image_topic: str = '') -> dict[str, str]:
-    """
-    Choose the topics of a bag that are read.
-
-    :param files: of the bag.
-    :param image_topic: the camera's topic; by default it is found.
-    :return: dict from topics to names of columns, Topic.becomes; what is lacking is left out.
-    :raises RecordingError: without a camera, when several would do, and for messages that cannot
-        be read.
-    """
-    bag = _Bag(files)
-    camera = bag.camera(image_topic)
-    found = {camera: IMAGE.becomes} | {
-        topic: name for name, one in BY_COLUMNS.items() if one is not IMAGE
-        for topic in bag.beside(one, camera)}
-    for channel in bag.every.values():
-        if channel.topic not in found or channel.type_name not in bag.types(channel.topic):
-            continue
-        source = f'{bag.source}: topic {escaped(channel.topic)}'
-        if channel.encoding != 'cdr':
-            raise RecordingError(
-                f'{source}: encoded as {channel.encoding[:40]!r}; only cdr can be read')
-        if channel.schema_encoding == 'ros2msg':
-            try:
-                check_schema(channel.type_name, channel.schema)
-            except RecordingError as error:
-                raise RecordingError(f'{source}: {error}') from error
+def total(parts: Iterable[Counts]) -> Counts:
+    """Add up the numbers of messages; what one part does not know nobody does."""
+    found: Counts = {}
+    for part in parts:
+        for key, count in part.items():
+            before = found.get(key, 0)
+            found[key] = None if before is None or count is None else before + count
     return found
 
 
-class _Bag:
-    """The topics of a bag."""
+@dataclass(frozen=True)
+class Choice:
+    """
+    What of a bag is read.
+
+    :param topics: names of columns, Topic.becomes, by topic; the camera's is the first.
+    :param size: (height, width) of the first picture, before it is cut; None without any.
+    :param doubts: lines to warn of.
+    """
+
+    topics: dict[str, str]
+    size: tuple[int, int] | None
+    doubts: list[str] = field(default_factory=list)
+
+
+class Bag:
+    """
+    A recording: files in playing order, each opened once, when something of it is asked.
+
+    :param files: paths of .mcap or .db3 files.
+    :ivar source: what messages call it.
+    """
 
     def __init__(self, files: Sequence[Path]) -> None:
-        self.files, self.source = files, list_paths(files)
-        self.channels: dict[str, Channel] = {}  # of several types, the one that fits the name
-        self.every: dict[tuple[str, str], Channel] = {}  # by topic and type
-        self.counts = Counter[str]()  # of messages with the types, as far as they are known
-        counts = Counter[tuple[str, str]]()
-        self.unusable: dict[str, str] = {}  # why no picture of a topic can be used
-        damage = []
-        for file in map(open_file, files):
-            file.topics()
-            self.every |= {(one.topic, one.type_name): one for one in file.channels.values()}
-            for one, count in file.counts().items():
-                counts[one] += count
-            losses = sorted(file.losses, key=lambda loss: not loss.what)
-            if losses and not any(file.counts().values()):
-                damage.append(f'{file.path}: holds no message that can be read; '
-                              f'{describe(losses)[0]}')
-        for (topic, kind), channel in self.every.items():
-            if topic not in self.channels or kind in (_named_best(topic) or IMAGE).types:
-                self.channels[topic] = channel
-        for (topic, kind), count in counts.items():
-            if kind in self.types(topic):
-                self.counts[topic] += count
-        if not self.channels or (counts and not any(counts.values())):
-            raise RecordingError(damage[0] if damage else f'{self.source}: holds no message')
+        self.files, self.source = tuple(files), list_paths(files)
 
-    def camera(self, wanted: str) -> str:
+    def choose(self, image_topic: str = '') -> Choice:
+        """
+        Choose the topics that are read.
+
+        :param image_topic: the camera's topic; by default it is found.
+        :raises RecordingError: without a camera, when several would do, and for messages that
+            cannot be read.
+        """
+        if all(count == 0 for count in self.held.values()):
+            why = next((f'{file.path}: holds no message that can be read; '
+                        f'{describe(sorted(file.defects, key=lambda one: not one.what))[0]}'
+                        for file in self.opened if file.defects and not any(
+                            file.counts().values())), f'{self.source}: holds no message')
+            raise RecordingError(why)
+        camera, doubts = self._camera(image_topic), list[str]()
+        topics = {camera: IMAGE.becomes} | {
+            topic: name for name, one in BY_COLUMNS.items() if one is not IMAGE
+            for topic in self._beside(one, camera, doubts)}
+        for channel in self._every:
+            if channel.topic not in topics or channel.type_name not in self._types(channel.topic):
+                continue
+            source = f'{self.source}: topic {escaped(channel.topic)}'
+            if channel.encoding != 'cdr':
+                raise RecordingError(
+                    f'{source}: encoded as {channel.encoding[:40]!r}; only cdr can be read')
+            if channel.schema_encoding == 'ros2msg':
+                try:
+                    check_schema(channel.type_name, channel.schema)
+                except RecordingError as error:
+                    raise RecordingError(f'{source}: {error}') from error
+        sizes = (first_size(file, camera) for file in self.opened)
+        choice = Choice(topics, next(filter(None, sizes), None), doubts)
+        for file in self.opened:
+            file.close()
+        return choice
+
+    @cached_property
+    def opened(self) -> list[McapFile]:
+        """
+        The files.
+
+        :raises RecordingError: for one of which nothing can be read.
+        """
+        return list(map(open_file, self.files))
+
+    @cached_property
+    def _every(self) -> list[Channel]:
+        """The channels, one a topic and type."""
+        return list({(one.topic, one.type_name): one for file in self.opened
+                     for one in file.channels.values()}.values())
+
+    @cached_property
+    def held(self) -> Counts:
+        """The numbers of messages by topic and type; None where nothing tells it."""
+        return total(file.counts() for file in self.opened)
+
+    @cached_property
+    def channels(self) -> dict[str, Channel]:
+        """A channel by topic; of several types the one that fits the name."""
+        found: dict[str, Channel] = {}
+        for one in self._every:
+            if one.topic not in found or one.type_name in (_named_best(one.topic) or IMAGE).types:
+                found[one.topic] = one
+        return found
+
+    @cached_property
+    def _counts(self) -> dict[str, int]:
+        """The numbers of messages of the types that are read, by topic, as far as known."""
+        found: dict[str, int] = {}
+        for (topic, kind), count in self.held.items():
+            if kind in self._types(topic) and count is not None:
+                found[topic] = found.get(topic, 0) + count
+        return found
+
+    def _camera(self, wanted: str) -> str:
         """Return the camera's topic."""
         pictures = [topic for topic, channel in self.channels.items()
                     if channel.type_name in IMAGE.types]
@@ -107,113 +159,112 @@ class _Bag:
                 wanted = f'{wanted}/compressed'
             if wanted not in pictures:
                 raise RecordingError(f'{self.source}: no topic {escaped(wanted)} of type '
-                                     f'{" or ".join(IMAGE.types)}; {self.known}')
-            if self.counts.get(wanted) == 0:
+                                     f'{" or ".join(IMAGE.types)}; {self._known}')
+            if self._counts.get(wanted) == 0:
                 raise RecordingError(f'{self.source}: topic {escaped(wanted)} holds no message; '
-                                     f'{self.known}')
+                                     f'{self._known}')
             return wanted
-        left = [topic for topic in pictures if self.counts.get(topic) != 0
+        left = [topic for topic in pictures if self._counts.get(topic) != 0
                 and _named_best(topic) in (None, IMAGE)] or [
                 topic for topic in pictures if _named_best(topic) is IMAGE]
-        most = max((self.counts.get(topic, 0) for topic in left), default=0)
+        most = max((self._counts.get(topic, 0) for topic in left), default=0)
         rules: tuple[Callable[[str], object], ...] = (
-            self.is_main_one,
-            lambda topic: _named_best(topic) is IMAGE and self.picture(topic) is not None,
-            lambda topic: self.counts.get(topic, most) * _FEW > most,
-            lambda topic: self.picture(topic) is not None,
+            self._is_main_one,
+            lambda topic: _named_best(topic) is IMAGE and self._is_usable(topic),
+            lambda topic: self._counts.get(topic, most) * _FEW > most,
+            lambda topic: self._is_usable(topic),
             # Of a camera that is there raw, too, nothing more is learned from compressed pictures.
             lambda topic: _plain(topic) == topic or _plain(topic) not in left,
-            self.is_coloured)
+            self._is_coloured)
         for rule in rules:
             if len(left) > 1:
                 left = [topic for topic in left if rule(topic)] or left
-        if not left and (why := explain(self.channels.values())):
-            raise RecordingError(f'{self.source}: {why}; {self.known}')
         if not left:
-            raise RecordingError(
-                f'{self.source}: no topic ends in {IMAGE.recorded} with type {IMAGE.type}; name '
-                f'the camera topic (--image-topic) if it is called otherwise; {self.known}')
-        if all(self.picture(topic) is None for topic in left) and len(left) > 1:
-            why = '; '.join(f'{escaped(topic)}: {self.unusable[topic]}' for topic in left[:3])
+            why = _explain(self.channels.values())
+            raise RecordingError(f'{self.source}: ' + (why or (
+                f'no topic ends in {IMAGE.recorded} with type {IMAGE.type}; name the camera topic '
+                '(--image-topic) if it is called otherwise')) + f'; {self._known}')
+        if len(left) > 1 and not any(map(self._is_usable, left)):
+            why = '; '.join(f'{escaped(topic)}: {self._picture(topic)}' for topic in left[:3])
             raise RecordingError(f'{self.source}: none of its topics of pictures can be used: '
-                                 f'{self.listing(left)}; {why}')
+                                 f'{self._listing(left)}; {why}')
         if len(left) > 1:
             raise RecordingError(
-                f'{self.source}: several topics could be {IMAGE.recorded}: {self.listing(left)}; '
+                f'{self.source}: several topics could be {IMAGE.recorded}: {self._listing(left)}; '
                 'name the camera topic (--image-topic)')
         return left[0]
 
-    def types(self, topic: str) -> tuple[str, ...]:
+    def _types(self, topic: str) -> tuple[str, ...]:
         """Return the types of a topic's messages that are read."""
         kind = self.channels[topic].type_name
         return IMAGE.types if kind in IMAGE.types else (kind,)
 
-    def is_main_one(self, topic: str) -> bool:
+    def _is_main_one(self, topic: str) -> bool:
         """Tell whether its other topic, raw or compressed, has less than twice its pictures."""
         raw = _plain(topic)
         other = raw if raw != topic else f'{topic}/compressed'
-        return not (0 < 2 * self.counts[topic] <= self.counts[other]
+        return not (0 < 2 * self._counts.get(topic, 0) <= self._counts.get(other, 0)
                     and self.channels[other].type_name in IMAGE.types
-                    and self.picture(other) is not None)
+                    and self._is_usable(other))
 
-    def beside(self, one: Topic, camera: str) -> list[str]:
+    def _beside(self, one: Topic, camera: str, doubts: list[str]) -> list[str]:
         """Return the topics that are read as one of ours, beside a camera."""
         found = [topic for topic, channel in self.channels.items()
                  if channel.type_name in one.types and _named_best(topic) is one
-                 and self.counts.get(topic) != 0]
+                 and self._counts.get(topic) != 0]
         found = [topic for topic in found if _plain(topic) == topic or _plain(topic) not in found]
         above = [topic for topic in found
                  if camera.startswith(_plain(topic).removesuffix(one.name))]
         if above or len(found) < 2:
             return sorted(above, key=len)[-1:] or found
         if one is JOINT_STATES:
-            told, arms = {topic: self.joints(topic) for topic in found}, known_arms()
-            places = [topic for topic, names in told.items() if find_joints(names, arms)
-                      or names.keys() & set(PLACE)]
+            told = {topic: next(map(decode_positions, self._first(topic)), {}) for topic in found}
+            places = [topic for topic, names in told.items()
+                      if find_joints(names, known_arms()) or names.keys() & set(PLACE)]
             found = [topic for topic in found if topic in places
                      or told[topic].keys() & set(GRIPPER_JOINTS)]
             if len(places) < 2:
                 return found
-        warnings.warn(
-            f'{self.source}: several topics could be {one.recorded}: {self.listing(found)}; none '
-            'is read, as none is in the namespace of the camera', RecordingWarning, stacklevel=4)
+        doubts.append(
+            f'several topics could be {one.recorded}: {self._listing(found)}; none is read, as '
+            'none is in the namespace of the camera')
         return []
 
-    def picture(self, topic: str) -> np.ndarray | None:
-        """Return one of the first pictures of a topic, None without any that can be used."""
-        self.unusable[topic] = 'damaged'
+    def _picture(self, topic: str) -> np.ndarray | str:
+        """Return one of the first pictures of a topic, or why none of them can be used."""
+        why = 'damaged'
         for message in self._first(topic):
             try:
                 return decode_image(message)
             except ImageError as error:
-                self.unusable[topic] = str(error)
-        return None
+                why = str(error)
+        return why
 
-    def is_coloured(self, topic: str) -> bool:
+    def _is_usable(self, topic: str) -> bool:
+        """Tell whether one of the first pictures of a topic can be used."""
+        return isinstance(self._picture(topic), np.ndarray)
+
+    def _is_coloured(self, topic: str) -> bool:
         """Tell whether one of the first pictures of a topic has colours."""
-        picture = self.picture(topic)
-        return picture is not None and bool(np.ptp(picture, -1).any())
+        picture = self._picture(topic)
+        return isinstance(picture, np.ndarray) and bool(np.ptp(picture, -1).any())
 
-    def joints(self, topic: str) -> Mapping[str, float]:
-        """Return the joints in the first message of a topic."""
-        return next((decode_positions(message) for message in self._first(topic)), {})
-
-    def listing(self, topics: Sequence[str]) -> str:
+    def _listing(self, topics: Sequence[str]) -> str:
         """List topics with the number of their messages."""
-        return listing((f'{topic} ({self.counts.get(topic, "?")} messages)'
+        return listing((f'{topic} ({self._counts.get(topic, "?")} messages)'
                         for topic in sorted(topics)), 20)
 
     @cached_property
-    def known(self) -> str:
+    def _known(self) -> str:
         """All topics, in words."""
         return 'topics found: ' + (listing((
-            f'{topic} ({channel.type_name}, {self.counts.get(topic, "?")} messages)'
+            f'{topic} ({channel.type_name}, {self._counts.get(topic, "?")} messages)'
             for topic, channel in sorted(self.channels.items())), 20) or 'none')
 
     def _first(self, topic: str) -> list[Any]:
         """Return the first messages of a topic that can be decoded."""
-        found, types = [], self.types(topic)
-        for file in map(open_file, self.files):
+        found, types = [], self._types(topic)
+        for file in self.opened:
             fitting = (one for one in file.messages({topic}) if one[0].type_name in types)
             for channel, *_, data in islice(fitting, _LOOKED_AT):
                 with suppress(RecordingError):
@@ -232,3 +283,15 @@ def _named_best(name: str) -> Topic | None:
     """Return the Topic whose name is the longest that a full name ends in."""
     return max((topic for topic in TOPICS if topic.is_called(name)),
                key=lambda topic: len(topic.name), default=None)
+
+
+def _explain(channels: Collection[Channel]) -> str:
+    """Return why a bag has no camera that can be read, and what helps; '' if unknown."""
+    for channel in channels:
+        if channel.type_name.endswith(_PACKETS):
+            return (f'topic {escaped(channel.topic)} holds packets of a video, which are not '
+                    'read; record the topic of its raw or compressed pictures, or those that '
+                    'image_transport republish makes of it')
+    other = sorted({channel.encoding for channel in channels} - {'cdr'})
+    return f'its messages are encoded as {listing(other)}; only those of ROS 2 are read; ' \
+        'record its topics' if other else ''

@@ -3,23 +3,21 @@
 """
 Write recordings: MCAP files and bags as rosbag2 would write them with `ros2 bag record -s mcap`.
 
-`BagWriter` writes the messages of a running system, `EpisodeWriter` finished episodes.
+`BagWriter` writes the messages of a running system, `EpisodeWriter` finished episodes. Equal input
+gives equal bytes: no clock is read into the file.
 """
 
 from contextlib import suppress
 import os
 from pathlib import Path
-import struct
 from typing import Any, Self
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.files import storage_errors
-from tap_ros.base.text import escaped
 from tap_ros.messages import topics
 from tap_ros.messages.images import camera_info_fields, image_fields, mask_fields
 from tap_ros.messages.joints import joint_fields
@@ -27,10 +25,122 @@ from tap_ros.messages.objects import objects_fields
 from tap_ros.messages.stamps import header_fields, stamp_fields
 from tap_ros.recording import metadata
 from tap_ros.recording.episode import check_episode, Episode
-from tap_ros.recording.file_writer import FileWriter
-from tap_ros.recording.messages import encode, type_hash, typestore
+from tap_ros.recording.mcap_file import McapFile
+from tap_ros.recording.messages import encode, schema_text, type_hash, typestore
 
 EPISODE_GAP_NS = 10**9  # between episodes whose stamps do not follow each other
+LIBRARY = 'tap_ros 1'
+CHUNK_BYTES = 786432  # rosbag2's default
+_COMPRESSIONS = {'none': CompressionType.NONE, '': CompressionType.NONE,
+                 'zstd': CompressionType.ZSTD, 'lz4': CompressionType.LZ4}
+
+
+class FileWriter:
+    """
+    Write serialized messages into one MCAP file.
+
+    Complete chunks are readable even when the process is killed. `close` finishes the file.
+
+    :param path: of the file; must not exist.
+    :param name: of the file in its bag; by default the file's own.
+    :param compression: 'zstd', 'lz4' or 'none', of the chunks.
+    :param chunk_bytes: size at which a chunk is finished.
+    :raises RecordingError: for an unknown compression, and a file that exists.
+    """
+
+    def __init__(self, path: str | Path, name: str | None = None, compression: str = 'zstd',
+                 chunk_bytes: int = CHUNK_BYTES) -> None:
+        if compression not in _COMPRESSIONS:
+            raise RecordingError(
+                f'compression: expected zstd, lz4 or none, got {compression!r}')
+        self.path = Path(path)
+        self._name = name or self.path.name
+        try:
+            self._stream = open(self.path, 'xb')
+        except OSError as error:
+            raise RecordingError(f'{self.path}: cannot be created: {error.strerror}') from error
+        self._writer = Writer(
+            self._stream, chunk_size=chunk_bytes, compression=_COMPRESSIONS[compression],
+            index_types=IndexType.ALL)
+        self._writer.start(profile='ros2', library=LIBRARY)
+        self._schemas: dict[str, int] = {}  # type -> id
+        self._channels: dict[str, int] = {}  # topic -> id
+        self._info: dict[str, Any] = {
+            'path': self._name, 'start': 0, 'end': 0, 'message_count': 0, 'topics': {}}
+
+    def write_raw(self, topic: str, type_name: str, data: bytes, log_time_ns: int,
+                  publish_time_ns: int | None = None, qos: topics.Qos | None = None) -> None:
+        """
+        Append one message.
+
+        :param topic: full name, for example '/camera/image_raw'.
+        :param type_name: for example 'sensor_msgs/msg/Image'.
+        :param data: the serialized message (CDR), bytes.
+        :param log_time_ns: when it was received.
+        :param publish_time_ns: when it was published; by default the same.
+        :param qos: topics.Qos offered by the publisher; used at the topic's first message.
+        :raises RecordingError: for a type without definition, or another one than before.
+        :raises StorageError: when it cannot be written.
+        """
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._open_topic(topic, type_name, qos or topics.default_qos(topic))
+        info = self._info['topics'][topic]
+        if info['type'] != type_name:
+            raise RecordingError(
+                f'{self.path}: topic {topic} has the type {info["type"]}, not {type_name}')
+        publish = log_time_ns if publish_time_ns is None else publish_time_ns
+        with storage_errors(self.path):
+            self._writer.add_message(channel, int(log_time_ns), data, int(publish), info['count'])
+        info['count'] += 1
+        total = self._info
+        first = total['message_count'] == 0
+        total['start'] = log_time_ns if first else min(total['start'], log_time_ns)
+        total['end'] = max(total['end'], log_time_ns)
+        total['message_count'] += 1
+
+    def flush(self) -> None:
+        """Finish the chunk in progress, so that what was written so far can be read."""
+        with storage_errors(self.path):
+            self._writer.flush()
+
+    def close(self) -> dict[str, Any]:
+        """
+        Finish the file.
+
+        :return: dict that describes it, as metadata.bag_information takes it.
+        :raises StorageError: when it cannot be written; what was flushed before is readable.
+        """
+        if not self._stream.closed:
+            text = metadata.to_yaml(metadata.bag_information([self._info]))
+            try:
+                with storage_errors(self.path):
+                    self._writer.add_metadata('rosbag2', {'serialized_metadata': text})
+                    self._writer.finish()
+                    self._stream.flush()
+                    os.fsync(self._stream.fileno())
+            finally:
+                self.abandon()
+        return self._info
+
+    def abandon(self) -> None:
+        """Close without finishing the file; what was flushed is readable."""
+        with suppress(OSError):  # what a full disk refuses again
+            self._stream.close()
+
+    def _open_topic(self, topic: str, type_name: str, qos: topics.Qos) -> int:
+        """Register a topic, and its type when it is new."""
+        if type_name not in self._schemas:
+            self._schemas[type_name] = self._writer.register_schema(
+                type_name, 'ros2msg', schema_text(type_name).encode())
+        profiles = [qos.profile()]
+        self._channels[topic] = self._writer.register_channel(
+            topic, 'cdr', self._schemas[type_name],
+            {'offered_qos_profiles': metadata.to_yaml(profiles).strip(),
+             'topic_type_hash': type_hash(type_name)})
+        self._info['topics'][topic] = {
+            'type': type_name, 'qos': profiles, 'type_hash': type_hash(type_name), 'count': 0}
+        return self._channels[topic]
 
 
 class BagWriter(FileWriter):
@@ -157,19 +267,16 @@ class EpisodeWriter:
 
     def _goal(self, episode: Episode, stamp: int) -> None:
         """Write the goal; an empty one takes back that of the episode before."""
-        for topic, fields, picture in (
-                (topics.GOAL_IMAGE, image_fields, episode.goal_frame),
-                (topics.GOAL_ROBOT_MASK, mask_fields, episode.goal_mask)):
-            if picture is not None or topic in self._goals:
-                self._put(topic, stamp, fields(picture, stamp, CAMERA_FRAME))
-            (self._goals.discard if picture is None else self._goals.add)(topic)
-        if episode.object_names or topics.GOAL_OBJECTS in self._goals:
-            self._put(topics.GOAL_OBJECTS, stamp, objects_fields(
-                episode.object_names, episode.goal_pixels, episode.goal_poses, stamp,
-                WORLD_FRAME, episode.object_source))
-            self._goals.add(topics.GOAL_OBJECTS)
-            if not episode.object_names:
-                self._goals.discard(topics.GOAL_OBJECTS)
+        at = stamp, CAMERA_FRAME
+        for topic, goal, fields in (
+                (topics.GOAL_IMAGE, episode.goal_frame, image_fields(episode.goal_frame, *at)),
+                (topics.GOAL_ROBOT_MASK, episode.goal_mask, mask_fields(episode.goal_mask, *at)),
+                (topics.GOAL_OBJECTS, episode.object_names or None, objects_fields(
+                    episode.object_names, episode.goal_pixels, episode.goal_poses, stamp,
+                    WORLD_FRAME, episode.object_source))):
+            if goal is not None or topic in self._goals:
+                self._put(topic, stamp, fields)
+            (self._goals.discard if goal is None else self._goals.add)(topic)
 
     def _mark(self, episode: Episode, stamp: int, event: int) -> None:
         self._put(topics.EPISODE, stamp, {
@@ -206,23 +313,12 @@ def count_episodes(path: Path) -> int:
 
 def _describe(path: Path) -> dict[str, Any]:
     """Describe a finished file as FileWriter.close does."""
-    try:
-        with open(path, 'rb') as stream:
-            summary = make_reader(stream).get_summary()
-    except (OSError, McapError, ValueError, LookupError, ArithmeticError, MemoryError,
-            struct.error) as error:
-        raise RecordingError(
-            f'{path}: not a finished MCAP file: {escaped(error)}') from error
-    if summary is None or summary.statistics is None:
+    file = McapFile(path)
+    if not (statistics := file.summary.statistics):
         raise RecordingError(f'{path}: not a finished MCAP file: it has no summary')
-    counts = summary.statistics.channel_message_counts
-    found = {}
-    for channel in summary.channels.values():
-        kind = summary.schemas[channel.schema_id].name
-        found[channel.topic] = {
-            'type': kind, 'qos': [topics.default_qos(channel.topic).profile()],
-            'type_hash': type_hash(kind), 'count': counts.get(channel.id, 0)}
     return {
-        'path': path.name, 'start': summary.statistics.message_start_time,
-        'end': summary.statistics.message_end_time,
-        'message_count': summary.statistics.message_count, 'topics': found}
+        'path': path.name, 'start': statistics.message_start_time,
+        'end': statistics.message_end_time, 'message_count': statistics.message_count,
+        'topics': {topic: {'type': kind, 'qos': [topics.default_qos(topic).profile()],
+                           'type_hash': type_hash(kind), 'count': count}
+                   for (topic, kind), count in file.counts().items()}}

@@ -45,11 +45,7 @@ class Mount:
     @property
     def pose(self) -> np.ndarray:
         """Pose (4, 4) of the base in the world."""
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        pose = np.eye(4)
-        pose[:2, :2] = [[c, -s], [s, c]]
-        pose[:3, 3] = self.position
-        return pose
+        return turned(self.position, 0.0, self.yaw)
 
 
 class Transform(NamedTuple):
@@ -174,7 +170,6 @@ class Arm:
                     'degrees/s')
 
     def _check(self, share: np.ndarray, of: str, values: np.ndarray, unit: str) -> None:
-        """Refuse shares of a limit above 1, naming the worst joint."""
         worst = int(share.argmax())
         if share[worst] > 1:
             raise KinematicsError(f'{self.joints[worst]} would be at {share[worst]:.2f} of {of} '
@@ -210,10 +205,8 @@ def find_joints(positions: Mapping[str, float], arms: Sequence[Arm]) -> list[flo
     :return: the arm's joints in order; None when there is not one arm, or more than one.
     """
     found = []
-    for arm in arms:
-        joints = arm.joints
-        prefixes = [other.removesuffix(joints[0]) for other in positions
-                    if other.endswith(joints[0])]
+    for joints in (arm.joints for arm in arms):
+        prefixes = [name.removesuffix(joints[0]) for name in positions if name.endswith(joints[0])]
         found += [[positions[prefix + joint] for joint in joints] for prefix in prefixes
                   if all(prefix + joint in positions for joint in joints)]
     return found[0] if len(found) == 1 else None

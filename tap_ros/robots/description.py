@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The URDF of an arm at its table, written from the numbers that the simulator uses."""
 
-from xml.etree import ElementTree
+from collections.abc import Iterable
 
 import numpy as np
 from tap_ros.base.contract import WORLD_FRAME
-from tap_ros.robots.arm import Arm, BASE_FRAME, DARK, Mount, TIP_FRAME
+from tap_ros.robots.arm import Arm, BASE_FRAME, DARK, Mount, Primitive, TIP_FRAME
 
 
 def robot_description(arm: Arm, mount: Mount | None = None,
@@ -22,70 +22,55 @@ def robot_description(arm: Arm, mount: Mount | None = None,
         of the link TIP_FRAME.
     """
     mount = mount or arm.mount
-    robot = ElementTree.Element('robot', name=f'{arm.name}_at_table')
-    ElementTree.SubElement(robot, 'link', name=WORLD_FRAME)
-    for number, name in enumerate(arm.links):
-        link = ElementTree.SubElement(robot, 'link', name=name)
-        for shape in arm.shapes:
-            if shape.link == number:
-                _add_cylinder(link, np.array(shape.start), np.array(shape.end), shape.radius,
-                              shape.colour, shape.capsule)
-    tip = ElementTree.SubElement(robot, 'link', name=TIP_FRAME)
-    if hand_radius is not None:
-        _add_cylinder(tip, np.array([0, 0, -mount.tool]), np.zeros(3), hand_radius, DARK, False)
-    _add_joint(robot, 'world_joint', 'fixed', WORLD_FRAME, BASE_FRAME,
-               mount.position, (0, 0, mount.yaw))
     *origins, ((x, y, z), tip_roll) = arm.origins
-    for i, (name, (place, roll)) in enumerate(zip(arm.joints, origins)):
-        joint = _add_joint(
-            robot, name, 'revolute', arm.links[i], arm.links[i + 1], place, (roll, 0, 0))
-        ElementTree.SubElement(joint, 'axis', xyz='0 0 1')
-        low, high = arm.limits[i]
-        ElementTree.SubElement(
-            joint, 'limit', lower=_text(low), upper=_text(high),
-            velocity=_text(arm.speeds[i]), effort=_text(arm.efforts[i]))
-    _add_joint(robot, 'gripper_joint', 'fixed', arm.links[-1], TIP_FRAME,
-               (x, y, z + mount.tool), (tip_roll, 0, 0))
-    ElementTree.indent(robot)
-    return ElementTree.tostring(robot, 'unicode', xml_declaration=True)
+    shapes = {WORLD_FRAME: [], TIP_FRAME: [], **{
+        name: [shape for shape in arm.shapes if shape.link == number]
+        for number, name in enumerate(arm.links)}}
+    if hand_radius is not None:
+        shapes[TIP_FRAME] = [Primitive(0, (0, 0, -mount.tool), (0, 0, 0), hand_radius, DARK)]
+    parts = ['<?xml version="1.0"?>', f'<robot name="{arm.name}_at_table">']
+    for name, seen in shapes.items():
+        parts += [f'<link name="{name}">', *(part for shape in seen for part in _shape(shape)),
+                  '</link>']
+    joints = [('world_joint', 'fixed', WORLD_FRAME, BASE_FRAME,
+               _origin(mount.position, (0, 0, mount.yaw)))]
+    for i, (place, roll) in enumerate(origins):
+        low, high, speed, effort = (_text([number]) for number in (
+            *arm.limits[i], arm.speeds[i], arm.efforts[i]))
+        joints.append((
+            arm.joints[i], 'revolute', arm.links[i], arm.links[i + 1],
+            f'{_origin(place, (roll, 0, 0))}<axis xyz="0 0 1"/><limit lower="{low}" '
+            f'upper="{high}" velocity="{speed}" effort="{effort}"/>'))
+    joints.append(('gripper_joint', 'fixed', arm.links[-1], TIP_FRAME,
+                   _origin((x, y, z + mount.tool), (tip_roll, 0, 0))))
+    parts += [f'<joint name="{name}" type="{kind}"><parent link="{parent}"/>'
+              f'<child link="{child}"/>{inside}</joint>'
+              for name, kind, parent, child, inside in joints]
+    return '\n'.join([*parts, '</robot>'])
 
 
-def _add_joint(robot: ElementTree.Element, name: str, kind: str, parent: str, child: str,
-               place: np.ndarray | tuple[float, float, float],
-               turn: tuple[float, float, float]) -> ElementTree.Element:
-    """Add a joint at a place (3,) in m with roll, pitch, yaw in rad."""
-    joint = ElementTree.SubElement(robot, 'joint', name=name, type=kind)
-    ElementTree.SubElement(joint, 'parent', link=parent)
-    ElementTree.SubElement(joint, 'child', link=child)
-    ElementTree.SubElement(joint, 'origin', xyz=_text(*place), rpy=_text(*turn))
-    return joint
-
-
-def _add_cylinder(link: ElementTree.Element, start: np.ndarray, end: np.ndarray, radius: float,
-                  colour: tuple[float, float, float], capsule: bool) -> None:
-    """Add a cylinder between two points, to be seen and to be bumped into."""
-    along = end - start
-    length = float(np.linalg.norm(along))
-    x, y, z = along / length
+def _shape(shape: Primitive) -> list[str]:
+    """Return what is seen and bumped into of a shape."""
+    start, end = np.array(shape.start), np.array(shape.end)
+    length = float(np.linalg.norm(end - start))
+    x, y, z = (end - start) / length
     # Roll and pitch that turn z into the cylinder's direction.
-    turn = (0.0, float(np.arctan2(np.hypot(x, y), z)), float(np.arctan2(y, x)))
-    for use in ('visual', 'collision'):
-        parts = [((start + end) / 2, turn, 'cylinder', {'radius': radius, 'length': length})]
-        if capsule:
-            parts += [(place, (0.0, 0.0, 0.0), 'sphere', {'radius': radius})
-                      for place in (start, end)]
-        for place, turned, kind, sizes in parts:
-            element = ElementTree.SubElement(link, use)
-            ElementTree.SubElement(element, 'origin', xyz=_text(*place), rpy=_text(*turned))
-            geometry = ElementTree.SubElement(element, 'geometry')
-            ElementTree.SubElement(
-                geometry, kind, {name: _text(size) for name, size in sizes.items()})
-            if use == 'visual':
-                name = '_'.join(f'{round(255 * part):02x}' for part in colour)
-                material = ElementTree.SubElement(element, 'material', name=name)
-                ElementTree.SubElement(material, 'color', rgba=_text(*colour, 1))
+    parts = [(_origin((start + end) / 2, (0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x))),
+              f'<cylinder radius="{_text([shape.radius])}" length="{_text([length])}"/>')]
+    if shape.capsule:
+        parts += [(_origin(place, (0, 0, 0)), f'<sphere radius="{_text([shape.radius])}"/>')
+                  for place in (start, end)]
+    name = '_'.join(f'{round(255 * part):02x}' for part in shape.colour)
+    material = f'<material name="{name}"><color rgba="{_text((*shape.colour, 1))}"/></material>'
+    return [f'<{use}>{origin}<geometry>{geometry}</geometry>{more}</{use}>'
+            for use, more in (('visual', material), ('collision', ''))
+            for origin, geometry in parts]
 
 
-def _text(*numbers: float) -> str:
-    """Return numbers as URDF writes them."""
+def _origin(place: Iterable[float], turn: Iterable[float]) -> str:
+    """Return the element of a place (3,) in m, with roll, pitch, yaw in rad."""
+    return f'<origin xyz="{_text(place)}" rpy="{_text(turn)}"/>'
+
+
+def _text(numbers: Iterable[float]) -> str:
     return ' '.join(repr(float(number)) for number in numbers)

@@ -1,27 +1,31 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The shapes of a robot and how its joints move them, from its URDF.
+The shapes of a robot and how its joints move them, from its URDF, as MuJoCo reads it.
 
 Only collision geometry of boxes, cylinders, spheres and capsules is read. Each becomes the corners
 of a convex polyhedron that just contains it.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from graphlib import CycleError, TopologicalSorter
 from itertools import product
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-import cv2
+import mujoco
 import numpy as np
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import escaped, listing
 
 MOST_CHARACTERS = 2**21
-MOST_LINKS = 1000
-MOVING = ('revolute', 'continuous', 'prismatic')
+MOST_LINKS, MOST_SHAPES = 300, 3000  # more take seconds to read
+KINDS = ('revolute', 'continuous', 'prismatic', 'fixed')
+SHAPES = ('box', 'cylinder', 'sphere', 'capsule')
+# What MuJoCo is given of each element: neither files, nor what masses and limits would need.
+_READ = {'robot': ('link', 'joint'), 'link': ('collision',),
+         'joint': ('parent', 'child', 'origin', 'axis'), 'collision': ('origin', 'geometry')}
+_NUMBERS = ('xyz', 'rpy', 'size', 'radius', 'length', 'multiplier', 'offset')
+_LINK = 'link '  # before names of links: a root named world would be MuJoCo's own
 _SIDES = 24  # of a circle
 
 
@@ -32,38 +36,34 @@ class Shape(NamedTuple):
     corners: np.ndarray  # (N, 3) m, in the frame of the link
 
 
-class Joint(NamedTuple):
-    """How a link is held by another."""
+class Mimic(NamedTuple):
+    """Whose position a joint follows: its own is factor * leader's + offset."""
 
-    name: str
-    kind: str
-    parent: str
-    child: str
-    origin: np.ndarray  # (4, 4), of the child in the parent where the joint is at zero
-    axis: np.ndarray  # (3,), of length 1
-    leader: str  # the joint whose position counts; its own name unless it mimics another
-    factor: float  # its position is factor * leader's + offset
-    offset: float
+    leader: str
+    factor: float = 1.0
+    offset: float = 0.0
 
 
-@dataclass(frozen=True)
 class Robot:
-    """A tree of links."""
+    """
+    A tree of links.
 
-    root: str
-    joints: tuple[Joint, ...]  # parents first
-    shapes: tuple[Shape, ...]
+    :ivar links: their names, the root first.
+    :ivar positions: names of the joints whose positions are needed.
+    :ivar shapes: of all links.
+    """
 
-    @property
-    def positions(self) -> tuple[str, ...]:
-        """Names of the joints whose positions are needed."""
-        return tuple(dict.fromkeys(
-            joint.leader for joint in self.joints if joint.kind in MOVING))
-
-    @property
-    def links(self) -> tuple[str, ...]:
-        """Names of the links, the root first."""
-        return self.root, *(joint.child for joint in self.joints)
+    def __init__(self, spec: mujoco.MjSpec, mimics: Mapping[str, Mimic]) -> None:
+        spec.compiler.fusestatic = False
+        spec.compiler.boundmass = spec.compiler.boundinertia = 1  # nobody asks for the true ones
+        self._model = model = spec.compile()
+        self._data = mujoco.MjData(model)
+        self._joints = [mimics.get(name, Mimic(name)) for name in (
+            model.joint(i).name for i in range(model.njnt))]
+        self.links = tuple(model.body(i).name.removeprefix(_LINK) for i in range(1, model.nbody))
+        self.positions = tuple(dict.fromkeys(joint.leader for joint in self._joints))
+        self.shapes = tuple(Shape(self.links[model.geom_bodyid[i] - 1], _corners(model, i))
+                            for i in range(model.ngeom))
 
     def poses(self, positions: Mapping[str, float]) -> dict[str, np.ndarray]:
         """
@@ -71,17 +71,13 @@ class Robot:
 
         :param positions: rad or m by the names in `positions`.
         """
-        poses = {self.root: np.eye(4)}
-        for joint in self.joints:
-            move = np.eye(4)
-            if joint.kind in MOVING:
-                way = (joint.factor * positions[joint.leader] + joint.offset) * joint.axis
-                if joint.kind == 'prismatic':
-                    move[:3, 3] = way
-                else:
-                    move[:3, :3] = cv2.Rodrigues(way)[0]
-            poses[joint.child] = poses[joint.parent] @ joint.origin @ move
-        return poses
+        self._data.qpos[:] = [joint.factor * positions[joint.leader] + joint.offset
+                              for joint in self._joints]
+        mujoco.mj_kinematics(self._model, self._data)
+        poses = np.tile(np.eye(4), (len(self.links), 1, 1))
+        poses[:, :3, :3] = self._data.xmat[1:].reshape(-1, 3, 3)
+        poses[:, :3, 3] = self._data.xpos[1:]
+        return dict(zip(self.links, poses))
 
     def held_by(self, link: str) -> set[str]:
         """
@@ -93,9 +89,9 @@ class Robot:
             raise ConfigError(f'the robot has no link {escaped(link)}; it has '
                               f'{listing(self.links)}')
         found = {link}
-        for joint in self.joints:
-            if joint.parent in found:
-                found.add(joint.child)
+        for name, parent in zip(self.links, self._model.body_parentid[1:]):
+            if parent and self.links[parent - 1] in found:
+                found.add(name)
         return found
 
 
@@ -113,121 +109,81 @@ def read_urdf(text: str, source: str) -> Robot:
     try:
         # Bytes, since text that declares its encoding is refused.
         robot = ElementTree.fromstring(text.encode('utf-8', 'replace'))
-        links = [_name(link) for link in robot.iterfind('link')]
-        if robot.tag != 'robot' or not links:
-            raise ConfigError('is no URDF: expected <robot> with <link>s')
-        if len(links) > MOST_LINKS:
-            raise ConfigError(f'has {len(links)} links; at most {MOST_LINKS} are read')
-        joints = [_joint(element) for element in robot.iterfind('joint')]
-        shapes = tuple(
-            Shape(_name(link), _corners(collision, _name(link)))
-            for link in robot.iterfind('link') for collision in link.iterfind('collision'))
-        if not shapes:
-            raise ConfigError('has no collision geometry')
-        return _tree(links, {joint.name: joint for joint in joints}, shapes)
+        mimics = _checked(robot)
+        for element in robot.iter():
+            element[:] = [child for child in element
+                          if child.tag in _READ.get(element.tag, (child.tag,))]
+            name = 'name' if element.tag == 'link' else 'link'
+            if element.tag in ('link', 'parent', 'child'):
+                element.set(name, _LINK + element.get(name, ''))
+        return Robot(mujoco.MjSpec.from_string(ElementTree.tostring(robot, 'unicode')), mimics)
     except ConfigError as error:
         raise ConfigError(f'{source}: {error}') from error
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
         raise ConfigError(f'{source}: is no URDF: {escaped(error)}') from error
 
 
-def _tree(links: list[str], joints: dict[str, Joint], shapes: tuple[Shape, ...]) -> Robot:
-    """Put joints in order, parents first."""
-    for joint in joints.values():
-        if joint.parent not in links or joint.child not in links:
-            raise ConfigError(f'joint {escaped(joint.name)} holds a link that is not there')
-        if joint.leader not in joints or joints[joint.leader].leader != joint.leader:
-            raise ConfigError(f'joint {escaped(joint.name)} mimics {escaped(joint.leader)}, which '
-                              'is no joint, or mimics another')
-    holders = {joint.child: joint for joint in joints.values()}
-    try:
-        order = list(TopologicalSorter(
-            {child: [joint.parent] for child, joint in holders.items()}).static_order()) or links
-    except CycleError:
-        order = []
-    if not len(order) == len(links) == len(joints) + 1 == len(holders) + 1:
+def _checked(robot: ElementTree.Element) -> dict[str, Mimic]:
+    """Refuse what MuJoCo takes otherwise than it is meant; return which joints follow others."""
+    links = [link.get('name') for link in robot.iterfind('link')]
+    if robot.tag != 'robot' or not links:
+        raise ConfigError('is no URDF: expected <robot> with <link>s')
+    if len(links) > MOST_LINKS:
+        raise ConfigError(f'has {len(links)} links; at most {MOST_LINKS} are read')
+    for element in robot.iter():
+        for name in set(_NUMBERS) & set(element.attrib):
+            if not np.isfinite([float(word) for word in element.attrib[name].split()]).all():
+                raise ConfigError(f'{name}="{escaped(element.attrib[name], 60)}"; expected '
+                                  'numbers')
+    shapes = [(link.get('name'), next(collision.iterfind('geometry/*'), None)) for link in
+              robot.iterfind('link') for collision in link.iterfind('collision')]
+    if not 0 < len(shapes) <= MOST_SHAPES:
+        raise ConfigError(f'has collision geometries: {len(shapes)}; expected 1 to {MOST_SHAPES}')
+    for link, shape in shapes:
+        if shape is None or shape.tag not in SHAPES:
+            kind = 'shape that is missing' if shape is None else escaped(shape.tag)
+            raise ConfigError(f'link {escaped(link)} has a {kind}; expected {", ".join(SHAPES)}: '
+                              'replace meshes by such shapes')
+    children, mimics = [], {}
+    joints = {joint.get('name', ''): joint for joint in robot.iterfind('joint')}
+    for name, joint in joints.items():
+        parent, child, mimic = (joint.find(tag) for tag in ('parent', 'child', 'mimic'))
+        if joint.get('type') not in KINDS:
+            raise ConfigError(f'joint {escaped(name)} is of the type '
+                              f'{escaped(joint.get("type"))!r}; expected one of '
+                              f'{", ".join(KINDS)}')
+        if parent is None or child is None:
+            raise ConfigError(f'joint {escaped(name)} lacks its parent or child')
+        if not {parent.get('link'), child.get('link')} <= set(links):
+            raise ConfigError(f'joint {escaped(name)} holds a link that is not there')
+        children.append(child.get('link'))
+        if mimic is not None:
+            mimics[name] = Mimic(mimic.get('joint', ''), float(mimic.get('multiplier', 1)),
+                                 float(mimic.get('offset', 0)))
+    if not len(links) == len(set(links)) == len(set(children)) + 1 == len(children) + 1:
         raise ConfigError('its links are no tree: expected one root, and one joint that holds '
                           'each other link')
-    return Robot(order[0], tuple(holders[link] for link in order[1:]), shapes)
+    for name, mimic in mimics.items():
+        if mimic.leader not in joints or mimic.leader in mimics:
+            raise ConfigError(f'joint {escaped(name)} mimics {escaped(mimic.leader)}, which '
+                              'is no joint, or mimics another')
+    return mimics
 
 
-def _joint(element: ElementTree.Element) -> Joint:
-    name, kind = _name(element), element.get('type', '')
-    if kind not in (*MOVING, 'fixed'):
-        raise ConfigError(f'joint {escaped(name)} is of the type {escaped(kind)!r}; expected one '
-                          f'of {", ".join((*MOVING, "fixed"))}')
-    parent, child, axis, mimic = (
-        element.find(tag) for tag in ('parent', 'child', 'axis', 'mimic'))
-    if parent is None or child is None:
-        raise ConfigError(f'joint {escaped(name)} lacks its parent or child')
-    direction = _numbers(axis, 'xyz', '1 0 0', 3)
-    length = float(np.linalg.norm(direction))
-    if length == 0:
-        raise ConfigError(f'joint {escaped(name)} has an axis without direction')
-    leader, factor, offset = name, 1.0, 0.0
-    if mimic is not None:
-        leader = mimic.get('joint', '')
-        factor, = _numbers(mimic, 'multiplier', '1', 1)
-        offset, = _numbers(mimic, 'offset', '0', 1)
-    return Joint(name, kind, parent.get('link', ''), child.get('link', ''), _origin(element),
-                 direction / length, leader, float(factor), float(offset))
-
-
-def _corners(collision: ElementTree.Element, link: str) -> np.ndarray:
+def _corners(model: mujoco.MjModel, shape: int) -> np.ndarray:
     """Return (N, 3) corners that contain a shape, in the frame of the link."""
-    geometry = collision.find('geometry')
-    shape = geometry[0] if geometry is not None and len(geometry) else None
-    kind = '' if shape is None else shape.tag
-    if kind == 'box':
-        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * _numbers(shape, 'size', '', 3)
-    elif kind in ('sphere', 'cylinder', 'capsule'):
-        radius, = _numbers(shape, 'radius', '', 1)
-        length, = _numbers(shape, 'length', '', 1) if kind != 'sphere' else [0.0]
-        corners = (_circles(radius) if kind == 'cylinder' else _ball(radius)).repeat(2, 0)
-        corners[::2, 2] += length / 2
-        corners[1::2, 2] -= length / 2
+    kind, (radius, half, _) = model.geom_type[shape], model.geom_size[shape]
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        corners = np.array(list(product((-1, 1), repeat=3))) * model.geom_size[shape]
     else:
-        raise ConfigError(
-            f'link {escaped(link)} has a {escaped(kind) or "shape that is missing"}; expected '
-            'box, cylinder, sphere or capsule: replace meshes by such shapes')
-    origin = _origin(collision)
-    return corners @ origin[:3, :3].T + origin[:3, 3]
-
-
-def _circles(radius: float) -> np.ndarray:
-    """Return a polygon around a circle in the plane z = 0."""
-    angle = np.arange(_SIDES) * 2 * np.pi / _SIDES
-    x, y = np.cos(angle), np.sin(angle)
-    return np.stack([x, y, 0 * x], -1) * radius / np.cos(np.pi / _SIDES)
-
-
-def _ball(radius: float) -> np.ndarray:
-    """Return the corners of a polyhedron around a ball."""
-    polar = np.arange(_SIDES // 2 + 1) * 2 * np.pi / _SIDES
-    ring = _circles(radius)
-    points = np.sin(polar)[:, None, None] * ring
-    points[..., 2] = np.cos(polar)[:, None] * radius
-    return points.reshape(-1, 3) / np.cos(np.pi / _SIDES)
-
-
-def _origin(element: ElementTree.Element) -> np.ndarray:
-    """Return the pose (4, 4) that <origin> says."""
-    origin, pose = element.find('origin'), np.eye(4)
-    for axis, angle in zip(np.eye(3), _numbers(origin, 'rpy', '0 0 0', 3)):
-        pose[:3, :3] = cv2.Rodrigues(angle * axis)[0] @ pose[:3, :3]
-    pose[:3, 3] = _numbers(origin, 'xyz', '0 0 0', 3)
-    return pose
-
-
-def _numbers(element: ElementTree.Element | None, name: str, default: str,
-             count: int) -> np.ndarray:
-    """Return the numbers of an attribute."""
-    text = default if element is None else element.get(name, default)
-    values = np.array([float(word) for word in text.split()])
-    if len(values) != count or not np.isfinite(values).all():
-        raise ConfigError(f'{name}="{escaped(text, 60)}"; expected numbers: {count}')
-    return values
-
-
-def _name(element: ElementTree.Element) -> str:
-    return element.get('name', '')
+        angle = np.arange(_SIDES) * 2 * np.pi / _SIDES
+        outside = radius / np.cos(np.pi / _SIDES)  # a polygon around a circle
+        corners = outside * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+        if kind != mujoco.mjtGeom.mjGEOM_CYLINDER:  # rings around a ball
+            polar = angle[:_SIDES // 2 + 1, None, None]
+            corners = (np.sin(polar) * corners + np.cos(polar) * [0, 0, radius]
+                       ).reshape(-1, 3) / np.cos(np.pi / _SIDES)
+        corners = np.concatenate([corners - [0, 0, half], corners + [0, 0, half]])
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.geom_quat[shape])
+    return corners @ turn.reshape(3, 3).T + model.geom_pos[shape]

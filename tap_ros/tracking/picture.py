@@ -8,6 +8,7 @@ from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import View
 
 LIGHTNESS = 0.14  # weight of a step of L of OpenCV's 8-bit Lab, beside steps of a and b
+FEW = 4  # colours of a Palette, at most
 _LEVELS = np.arange(256)
 _WEIGHED = np.rint(np.outer(_LEVELS, (LIGHTNESS, 1, 1))).astype(np.uint8)[:, None]
 # The index of a colour has 3, 6 and 6 bits of L, a and b; and the middles of their bins.
@@ -42,12 +43,9 @@ class Picture:
         self.lab = np.asarray(cv2.LUT(lab, _WEIGHED))
         parts: list[np.ndarray] = [np.asarray(part) for part in cv2.split(cv2.LUT(lab, _INDEX))]
         self.index: np.ndarray = np.bitwise_or(np.bitwise_or(parts[0], parts[1]), parts[2])
-        if view.robot_mask is None:
-            self.hidden = np.zeros(self.size, bool)
-        else:
-            mask = np.asarray(view.robot_mask)
-            self.hidden = (mask if mask.shape == self.size else cv2.resize(
-                mask, (w, h), interpolation=cv2.INTER_NEAREST)) > 0
+        mask = np.zeros(self.size, np.uint8) if view.robot_mask is None else view.robot_mask
+        self.hidden = np.asarray(mask if mask.shape == self.size else cv2.resize(
+            mask, (w, h), interpolation=cv2.INTER_NEAREST)) > 0
 
     def apart(self, other: 'Picture') -> np.ndarray:
         """Return the distance (h, w) float32 of the colours of each pixel."""
@@ -68,18 +66,17 @@ class Palette:
     :param least: share of the colours near one of them without which it is left out.
     """
 
-    def __init__(self, colours: np.ndarray, count: int = 4, least: float = 0.0) -> None:
-        colours = np.ascontiguousarray(colours, np.float32)
-        if len(colours) > count:
+    def __init__(self, colours: np.ndarray, least: float = 0.0) -> None:
+        centres = np.ascontiguousarray(colours, np.float32)
+        if len(centres) > FEW:
             cv2.setRNGSeed(0)
-            _, labels, colours = cv2.kmeans(
-                colours, count, np.zeros((len(colours), 1), np.int32), (3, 15, 1.0), 2,
+            _, labels, found = cv2.kmeans(
+                centres, FEW, np.zeros((len(centres), 1), np.int32), (3, 15, 1.0), 2,
                 cv2.KMEANS_PP_CENTERS)
-            shares = np.bincount(np.ravel(labels), minlength=count) / len(labels)
-            colours = np.asarray(colours)[shares >= min(least, shares.max())]
-        self.centres = colours
+            shares = np.bincount(np.ravel(labels), minlength=FEW) / len(labels)
+            centres = np.asarray(found)[shares >= min(least, shares.max())]
         self._table = np.min([sum(np.abs(axis - value) for axis, value in zip(_AXES, centre))
-                              for centre in self.centres], 0).ravel()
+                              for centre in centres], 0).ravel()
 
     def distance(self, index: np.ndarray) -> np.ndarray:
         """Return the distances of colours by their index, any shape, float32."""

@@ -16,6 +16,7 @@ from tap_ros.tracking.protocols import LOST, SEEN, Tracked, View
 from tap_ros.tracking.silhouette import centre, silhouette
 from tap_ros.tracking.template import Matcher, Pose, Template
 
+LEAST_FAR = 0.3  # share of an object that has to be seen
 LEAST_SURE = 0.9  # confidence, else not found
 CHANGED = 8.0  # distance of colours
 LEAST_CHANGED = 60  # px of the working picture
@@ -30,15 +31,13 @@ _AROUND = np.stack(np.meshgrid(*[np.linspace(-0.03, 0.03, 5)] * 2), -1).reshape(
 
 
 def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (),
-           region: np.ndarray | None = None, extra: Sequence[np.ndarray] = (),
-           least: float = 0.3) -> Pose | None:
+           region: np.ndarray | None = None, extra: Sequence[np.ndarray] = ()) -> Pose | None:
     """
     Search all of a picture for an object, turned by any angle.
 
     :param avoid: places of other objects.
     :param region: (h, w) weights of places, or None.
     :param extra: places that are tried, too.
-    :param least: share of the object that has to be seen.
     """
     plane = matcher.plane
     side = max(5.0, template.area ** 0.5)
@@ -59,7 +58,7 @@ def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (
             continue
         places = place + _AROUND
         cost, seen = matcher.score(template, places, _TURNS, thin=3)
-        cost[seen < least] = np.inf
+        cost[seen < LEAST_FAR] = np.inf
         for i in cost.min(1).argsort()[:TRIED]:
             found = matcher.refine(template, places[cost[i].argmin()],
                                    float(_TURNS[i]) + template.angle, 0.02, 0.3, pull=0)
@@ -92,39 +91,34 @@ def change(first: Picture, second: Picture) -> np.ndarray:
 
 
 def register(first: Picture, picture: Picture, plane: Plane,
-             objects: Sequence[Sequence[Template]]) -> Tracked:
+             objects: Sequence[Template]) -> Tracked:
     """
-    Find objects by their templates, the one that fits best first.
+    Find objects by a template of each, the one that fits best first.
 
-    :param first: the picture of the first templates.
+    :param first: the picture of the templates.
     :return: Tracked, LOST what fits nowhere well enough.
     """
     matcher = Matcher(picture, plane)
     changed = (first.apart(picture) > CHANGED).astype(np.float32)
     region = KEPT + cv2.GaussianBlur(changed, (0, 0), 4)
-    found: dict[int, tuple[Pose, Template]] = {}
-    left = set(range(len(objects)))
-    while left:
-        avoid = [pose.place for pose, _ in found.values()]
-        tried = {}
-        for k in left:
-            poses = [(pose, key) for key in objects[k] if (pose := locate(
-                matcher, key, avoid, region, [objects[k][0].place])) is not None]
-            if poses:
-                tried[k] = min(poses, key=lambda one: one[0].cost)
+    found: dict[int, Pose] = {}
+    for _ in objects:
+        avoid = [pose.place for pose in found.values()]
+        tried = {k: pose for k, one in enumerate(objects) if k not in found and (
+            pose := locate(matcher, one, avoid, region, [one.place])) is not None}
         if not tried:
             break
-        best = min(tried, key=lambda k: tried[k][0].cost)
+        best = min(tried, key=lambda k: tried[k].cost)
         found[best] = tried[best]
-        left.remove(best)
     pixels, confidence = np.full((len(objects), 2), np.nan), np.zeros(len(objects))
     states, outlines = [LOST] * len(objects), [np.zeros((0, 2))] * len(objects)
-    for k, (pose, key) in found.items():
+    for k, pose in found.items():
         confidence[k] = pose.confidence
         if confidence[k] > LEAST_SURE:
             states[k] = SEEN
             pixels[k] = plane.enlarge(plane.middle_pixels(pose.place))
-            outlines[k] = plane.enlarge(plane.top_pixels(key.outlined(pose.place, pose.angle)))
+            outlines[k] = plane.enlarge(plane.top_pixels(
+                pose.template.outlined(pose.place, pose.angle)))
     return Tracked(pixels, tuple(states), confidence, tuple(outlines))
 
 

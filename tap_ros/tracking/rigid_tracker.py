@@ -56,10 +56,6 @@ class _Object:
     def __post_init__(self) -> None:
         self.shown = self.keys[0]
 
-    def nearest(self) -> list[Template]:
-        """Return its templates, those of the nearest angle first."""
-        return sorted(self.keys, key=lambda key: abs(_turned(key.angle - self.angle)))
-
 
 class RigidTracker:
     """
@@ -100,9 +96,8 @@ class RigidTracker:
         if not self._objects:
             return self._tracked()
         picture = Picture(view, self._plane)
-        hand = None
-        if view.gripper is not None and self._gripper is not None:
-            hand = np.stack([self._gripper, view.gripper])[:, :3]
+        hand = None if view.gripper is None or self._gripper is None else (
+            np.stack([self._gripper, view.gripper])[:, :3])
         self._gripper = view.gripper
         for one in self._objects:
             self._follow(one, picture, hand)
@@ -111,7 +106,7 @@ class RigidTracker:
     def find(self, view: View) -> Tracked:
         """Find the objects in another picture; see Tracker."""
         return register(self._first, Picture(view, self._plane), self._plane,
-                        [[one.face] for one in self._objects])
+                        [one.face for one in self._objects])
 
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
@@ -121,12 +116,11 @@ class RigidTracker:
         if one.age and hand is not None:
             one.place = one.place + _pushed(one, hand)
         matcher = Matcher(picture, self._plane, self._covered(one, picture))
-        keys = one.nearest()
-        found = self._search(one, keys, matcher, hand)
-        pose, key = found if found is not None else (None, keys[0])
+        keys = sorted(one.keys, key=lambda key: abs(_turned(key.angle - one.angle)))
+        pose = self._search(one, keys, matcher, hand)
         if pose is not None and pose.fit > GOOD:
-            one.place, one.angle, one.age, one.shown = pose.place, pose.angle, 0, key
-            one.state, one.confidence = SEEN, pose.confidence
+            one.place, one.angle, one.shown = pose.place, pose.angle, pose.template
+            one.age, one.state, one.confidence = 0, SEEN, pose.confidence
             nearest = min(abs(_turned(other.angle - one.angle)) for other in one.keys)
             one.around = self._window(one), picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
@@ -144,9 +138,9 @@ class RigidTracker:
         one.confidence = first * fall ** (one.age - 1)
 
     def _search(self, one: _Object, keys: Sequence[Template], matcher: Matcher,
-                hand: np.ndarray | None) -> tuple[Pose, Template] | None:
+                hand: np.ndarray | None) -> Pose | None:
         """
-        Return the best pose near by, else anywhere; and the template it was found with.
+        Return the best pose near by, else anywhere.
 
         :param keys: templates of the object, the nearest first.
         """
@@ -159,28 +153,23 @@ class RigidTracker:
                 push = hand[1, :2] - hand[0, :2]
             elif one.age == 0:
                 reach, turn = REST, REST_TURN
-
-        def attempt(place: np.ndarray, key: Template) -> tuple[Pose, Template] | None:
-            pose = matcher.refine(key, place, one.angle, reach, turn)
-            return None if pose is None else (pose, key)
-
-        best = attempt(one.place, keys[0])
-        if best is not None and best[0].fit > GOOD and best[0].cost < GOOD_COST:
+        best = matcher.refine(keys[0], one.place, one.angle, reach, turn)
+        if best is not None and best.fit > GOOD and best.cost < GOOD_COST:
             return best
         others = [(one.place, key) for key in (*keys[1:2], one.face)]
         if push is not None and np.linalg.norm(push) > 0.01:
             others.append((one.place + push, keys[0]))
         for place, key in others:
-            other = attempt(place, key)
-            if other is not None and (best is None or other[0].cost < best[0].cost - 0.03):
+            other = matcher.refine(key, place, one.angle, reach, turn)
+            if other is not None and (best is None or other.cost < best.cost - 0.03):
                 best = other
-        if one.age >= 1 and not (best is not None and best[0].fit > GOOD):
+        if one.age >= 1 and not (best is not None and best.fit > GOOD):
             avoid = [other.place for other in self._objects if other is not one]
             pose = locate(matcher, one.face, avoid)
             if (pose is not None and pose.fit > GOOD and pose.cost < MOST_COST
                     and np.linalg.norm(pose.place - one.place) < 0.08 * (one.age + 1) + 0.03
-                    and (best is None or pose.cost < best[0].cost - 0.1)):
-                return pose, one.face
+                    and (best is None or pose.cost < best.cost - 0.1)):
+                return pose
         return best
 
     def _covered(self, one: _Object, picture: Picture) -> np.ndarray:
@@ -188,13 +177,12 @@ class RigidTracker:
         covered = picture.hidden.astype(np.uint8)
         for other in self._objects:
             if other is not one and other.state == SEEN:
-                cv2.fillPoly(covered, [np.rint(self._plane.top_pixels(other.shown.outlined(
-                    other.place, other.angle))).astype(np.int32)], 1)
+                cv2.fillPoly(covered, [np.rint(self._outline(other)).astype(np.int32)], 1)
         return covered > 0
 
     def _window(self, one: _Object) -> tuple[slice, slice]:
         """Return the part of the working picture that shows an object and what is next to it."""
-        pixels = self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
+        pixels = self._outline(one)
         (u, v), (right, low) = pixels.min(0).astype(int), pixels.max(0).astype(int)
         return np.s_[max(v - BESIDE, 0):max(low + BESIDE, 0), max(u - BESIDE, 0):max(
             right + BESIDE, 0)]
@@ -204,8 +192,8 @@ class RigidTracker:
         at, *others = self._plane.middle_pixels([one.place, *(
             other.place for other in self._objects if other is not one)])
         one.waits = WAITS
-        pixels = self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
-        radius = min(float(np.linalg.norm(pixels - at, axis=1).max()) * 1.4 + 4, RADIUS)
+        far = np.linalg.norm(self._outline(one) - at, axis=1).max()
+        radius = min(float(far) * 1.4 + 4, RADIUS)
         mask, _ = silhouette(picture, at, others, radius)
         beside = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
         if 0.6 < mask.sum() / one.keys[0].area < 1.6 and not (beside & picture.hidden).any():
@@ -219,12 +207,13 @@ class RigidTracker:
             self._plane.enlarge(self._plane.middle_pixels(places)) if self._objects else places,
             tuple(one.state for one in self._objects),
             np.array([one.confidence for one in self._objects]),
-            tuple(self._plane.enlarge(self._plane.top_pixels(one.shown.outlined(
-                one.place, one.angle))) for one in self._objects))
+            tuple(self._plane.enlarge(self._outline(one)) for one in self._objects))
+
+    def _outline(self, one: _Object) -> np.ndarray:
+        return self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
 
 
 def _still(window: tuple[slice, slice], before: Picture, now: Picture) -> bool:
-    """Return whether a window shows the same in two pictures."""
     if (before.hidden[window] != now.hidden[window]).any():
         return False
     apart = cv2.absdiff(before.lab[window], now.lab[window])
@@ -246,5 +235,4 @@ def _pushed(one: _Object, hand: np.ndarray) -> np.ndarray:
 
 
 def _turned(angle: float) -> float:
-    """Return an angle between -pi and pi."""
     return float(np.angle(np.exp(1j * angle)))

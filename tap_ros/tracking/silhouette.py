@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a click to the silhouette of an object."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ SPREAD = 1.5  # by which it exceeds what colours of the ring differ from the tab
 _RINGS = (0.75, 1.3)  # of RADIUS, between which the table is seen
 
 
-def silhouette(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray] = (),
+def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.ndarray = (),
                radius: float = RADIUS) -> tuple[np.ndarray, float]:
     """
     Cut out the object around a pixel by GrabCut.
@@ -41,11 +41,11 @@ def silhouette(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray] = 
     window = np.s_[y0:y1, x0:x1]
     y, x = np.ogrid[y0:y1, x0:x1]
     far = np.hypot(x - u, y - v)
+    apart = [np.hypot(x - other[0], y - other[1]) for other in others]  # from those
     hidden = picture.hidden[window]
     inner, outer = radius * _RINGS[0], radius * _RINGS[1]
     ring = (far > inner) & (far < outer)
-    for clear in (~hidden, *(np.hypot(x - other[0], y - other[1]) > radius * 0.6
-                             for other in others)):
+    for clear in (~hidden, *(gap > radius * 0.6 for gap in apart)):
         if (ring & clear).sum() > 50:
             ring &= clear
     empty = np.zeros(picture.size, bool)
@@ -60,14 +60,12 @@ def silhouette(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray] = 
     mask[near & (unlike > LIKELY)] = cv2.GC_PR_FGD
     mask[(far < radius / 3) & (unlike > POSSIBLE)] = cv2.GC_PR_FGD
     mask[far < CORE] = cv2.GC_FGD
-    own = near
-    for other in others:
-        own = own & (far < np.hypot(x - other[0], y - other[1]))
+    own = np.logical_and.reduce([near, *(far < gap for gap in apart)])
     mask[own & (unlike > SURE)] = cv2.GC_FGD
     mask[hidden] = cv2.GC_BGD
-    for other in others:
+    for other, gap in zip(others, apart):
         if np.hypot(other[0] - u, other[1] - v) > 2 * CORE:
-            mask[np.hypot(x - other[0], y - other[1]) < CORE] = cv2.GC_BGD
+            mask[gap < CORE] = cv2.GC_BGD
     if not (mask & 1).any():
         return empty, 0.0
     cv2.setRNGSeed(0)
@@ -92,8 +90,7 @@ def shaded(colours: np.ndarray, share: float) -> np.ndarray:
     return weighed(np.rint(colours * share).astype(np.uint8))[:, 0]
 
 
-def clicked(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray],
-            name: str) -> np.ndarray:
+def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str) -> np.ndarray:
     """
     Cut out the object under a click, see silhouette.
 
@@ -144,5 +141,4 @@ def middle(mask: np.ndarray, plane: Plane) -> np.ndarray:
 
 def centre(mask: np.ndarray) -> np.ndarray:
     """Return the mean pixel (2,) of a mask (h, w)."""
-    v, u = np.nonzero(mask)
-    return np.array([u.mean(), v.mean()])
+    return np.argwhere(mask)[:, ::-1].mean(0)

@@ -15,29 +15,13 @@ FAR = 22.0  # distance of colours that counts as none
 HIDDEN = 0.4  # cost of a point behind the robot: hiding there is no way out
 AROUND = 0.35  # weight of points beside the object that look like it
 OWN, SAME = 0.7, 0.8  # of FAR, below which a point has a colour of the object, or its own
+LEAST_SEEN = 0.2  # share of an object without which no pose near by is believed
 LEAST_SAME = 0.3  # share of points with their own colour without which nothing fits
 CONTRAST = 8.0  # of object and table, below which the surrounding says nothing
 ROUND = 0.06  # cost at the edge of the search: of two places alike the nearer one is meant
 # Of a pose's fit, cost and seen: logistic regression on 11,000 poses in simulated scenes, others
 # than those of docs/results/tracking.md.
 _BIAS, _FIT, _COST, _SEEN = 1.74, 3.25, 7.59, 2.55
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Where a template was found; angle relative to the picture that it was cut from."""
-
-    place: np.ndarray  # (2,) m
-    angle: float  # rad
-    cost: float  # 0 to 1.35
-    seen: float  # share of the points that the robot does not hide
-    fit: float  # share of those that have colours of the object
-
-    @property
-    def confidence(self) -> float:
-        """The probability that it is right within 2 px of a picture of 64."""
-        value = _BIAS + _FIT * self.fit - _COST * self.cost + _SEEN * self.seen
-        return float(1 / (1 + np.exp(-value)))
 
 
 class Template:
@@ -84,6 +68,24 @@ class Template:
         """Return the outline (N, 2) of the object at a place, turned from the first picture."""
         c, s = np.cos(angle - self.angle), np.sin(angle - self.angle)
         return place + self.outline @ np.array([[c, s], [-s, c]])
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a template was found; angle relative to the picture that it was cut from."""
+
+    place: np.ndarray  # (2,) m
+    angle: float  # rad
+    cost: float  # 0 to 1.35
+    seen: float  # share of the points that the robot does not hide
+    fit: float  # share of those that have colours of the object
+    template: Template
+
+    @property
+    def confidence(self) -> float:
+        """The probability that it is right within 2 px of a picture of 64."""
+        value = _BIAS + _FIT * self.fit - _COST * self.cost + _SEEN * self.seen
+        return float(1 / (1 + np.exp(-value)))
 
 
 class Matcher:
@@ -155,10 +157,9 @@ class Matcher:
         """Return how colours differ from the template's, (A, S, P); and which are seen."""
         P = index.shape[-1]
         words = self._words.take(index)
-        own = np.zeros((P, 4), np.uint8)
-        own[:, :3] = template.colours[::thin]
         read = words.view(np.uint8).reshape(-1, 4 * P)
-        apart = np.asarray(cv2.absdiff(read, np.tile(own.ravel(), (len(read), 1))))
+        own = np.pad(template.colours[::thin], ((0, 0), (0, 1))).ravel()
+        apart = np.asarray(cv2.absdiff(read, np.tile(own, (len(read), 1))))
         # the sum of the four bytes of each word
         sums = apart.view(np.uint32).reshape(index.shape)
         sums = (sums & 0xFF00FF) + ((sums >> 8) & 0xFF00FF)
@@ -178,12 +179,9 @@ class Matcher:
         c, s = np.cos(angles), np.sin(angles)
         x, y = points.T
         X, Y = np.outer(c, x) - np.outer(s, y), np.outer(s, x) + np.outer(c, y)  # (A, P)
-        rays = []
-        for across, down, still in self.plane.top:
-            moved = places @ (across, down) + still
-            rays.append(np.add((across * X + down * Y)[:, None].astype(np.float32),
-                               moved[None, :, None].astype(np.float32)))
-        u, v, scale = rays
+        u, v, scale = (np.add((across * X + down * Y)[:, None].astype(np.float32),
+                              (places @ (across, down) + still)[None, :, None].astype(np.float32))
+                       for across, down, still in self.plane.top)
         np.reciprocal(scale, out=scale)
         for ray in (u, v):
             ray *= scale
@@ -195,30 +193,28 @@ class Matcher:
         return v.astype(np.int32) * np.int32(w) + u.astype(np.int32), inside
 
     def refine(self, template: Template, place: np.ndarray, angle: float, reach: float,
-               turn: float, pull: float = ROUND, least: float = 0.2) -> Pose | None:
+               turn: float, pull: float = ROUND) -> Pose | None:
         """
         Search around a pose, coarsely and then finely.
 
         :param angle: of the object, relative to the first picture.
         :param reach: m and turn: rad, how far at first.
         :param pull: cost of being reach away.
-        :param least: share of the object that has to be seen.
         :return: the best Pose, its angle relative to the first picture; or None.
         """
-        centre, wide = np.asarray(place), reach
-        best, turned, found = centre, angle - template.angle, (0.0, 0.0)
+        best, turned, wide = place, angle - template.angle, reach
         for line, turns, thin, next_reach, next_turn in _LEVELS:
             places, angles = best + reach * line, turned + turn * turns
             cost, seen = self.score(template, places, angles, thin)
-            total = cost + pull * (((places - centre) / wide) ** 2).sum(1)
-            total[seen < least] = np.inf
+            total = cost + pull * (((places - place) / wide) ** 2).sum(1)
+            total[seen < LEAST_SEEN] = np.inf
             i, j = np.unravel_index(total.argmin(), total.shape)
             if not np.isfinite(total[i, j]):
                 return None
-            best, turned, found = places[j], float(angles[i]), (cost[i, j], seen[i, j])
+            best, turned = places[j], float(angles[i])
             reach, turn = reach * next_reach, turn * next_turn
-        return Pose(best, turned + template.angle, float(found[0]), float(found[1]),
-                    self.fit(template, best, turned))
+        return Pose(best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
+                    self.fit(template, best, turned), template)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
@@ -228,7 +224,6 @@ def _mean(values: np.ndarray) -> np.ndarray:
 
 
 def _round(side: int) -> np.ndarray:
-    """Return a round structuring element."""
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
 
 
@@ -240,7 +235,6 @@ def _draw(mask: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _square(count: int) -> np.ndarray:
-    """Return places (count * count, 2) from -1 to 1."""
     line = np.linspace(-1, 1, count)
     return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
 

@@ -9,16 +9,16 @@ and resumed sees the same ones.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Self, TYPE_CHECKING
 
 import numpy as np
-from tap_ros.training.frames import Frames, GOAL, MappedFrames
+from tap_ros.training.frames import FilledStore, Frames, gather, GOAL
 import torch
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
     from tap_ros.recording.episode import Episode
-    from tap_ros.training.inpainted import Filled
 
 REACHED = 2.0  # px
 
@@ -82,7 +82,7 @@ class Batch:
 @dataclass(frozen=True)
 class Sampling:
     """
-    What is taken from an episode; what is not told here, see training_config.TrainingConfig.
+    What is taken from an episode; what is not told here, see predictor_config.TrainingConfig.
 
     :param forward: whether the start picture is all of the context.
     :param fraction: take only the frame at this share of the episode, 0 to 1, as fixed-time
@@ -168,13 +168,13 @@ class Pictures:
     """
     Where the pictures of a batch come from, and what is known of them.
 
-    :param frames: where they come from, see training/frames.py; None: the store.
-    :param filled: with a robot mask, where targets and video come from; see training/inpainted.py.
+    :param frames: where they come from; None: the store.
+    :param filled: with a robot mask, where targets and video come from.
     :param preference: of every episode of the store w of its frames, (levels, T).
     """
 
     frames: Frames | None = None
-    filled: 'Filled | None' = None
+    filled: FilledStore | None = None
     preference: Sequence[np.ndarray] | None = None
 
 
@@ -191,22 +191,18 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     """
     rng = rng or np.random.default_rng(0)
     rows = [_choose(store, i, sampling, rng) for i in episodes]
-    B, T = len(rows), max(len(row.times) for row in rows)
-    times, shown = np.zeros((B, T), np.int64), np.zeros((B, T), np.int64)
-    valid = np.zeros((B, T), bool)
-    for b, row in enumerate(rows):
-        n = len(row.times)
-        times[b, :n], valid[b, :n] = row.times, True
-        shown[b] = row.start + times[b]
-    context, video, bounds = (np.array([getattr(row, name) for row in rows])
-                              for name in ('context', 'video', 'bounds'))
-    frames, filled = pictures.frames or MappedFrames(store), pictures.filled
-    preference = pictures.preference
+    T = max(len(row.times) for row in rows)
+    times = np.stack([np.pad(row.times, (0, T - len(row.times))) for row in rows])
+    valid = torch.arange(T) < torch.tensor([[len(row.times)] for row in rows])
+    context, video, bounds, starts = (np.array([getattr(row, name) for row in rows])
+                                      for name in ('context', 'video', 'bounds', 'start'))
+    shown = starts[:, None] + times
+    frames, filled = pictures.frames or partial(gather, store), pictures.filled
     first, last, end = torch.from_numpy(bounds).split(1, dim=1)
-    free = filled.frames if filled else frames
+    free, preference = filled.gather if filled else frames, pictures.preference
     batch = Batch(
         frames(episodes, context), free(episodes, shown), torch.from_numpy(times),
-        first, last, end, torch.from_numpy(valid),
+        first, last, end, valid,
         free(episodes, video) if sampling.video_frames else None,
         preference=None if preference is None else torch.from_numpy(np.stack(
             [preference[i][:, at] for i, at in zip(episodes, shown)])))
@@ -215,12 +211,11 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     bare = free(episodes, context)
     chosen = torch.tensor([row.filled for row in rows], device=bare.device)
     seen = torch.from_numpy(filled.seen[np.asarray(episodes)]).to(bare.device)
-    batch = replace(batch, seen=seen, bare=bare.clone(), context=torch.where(
-        chosen[:, None, None, None, None], bare, batch.context))
-    for shown_there in (batch.targets, batch.video, batch.bare):
-        if shown_there is not None:
-            shown_there.masked_fill_(~seen[:, None, ..., None], 0)
-    return batch
+    context = torch.where(chosen[:, None, None, None, None], bare, batch.context)
+    for pictures_there in (batch.targets, batch.video, bare):
+        if pictures_there is not None:
+            pictures_there.masked_fill_(~seen[:, None, ..., None], 0)
+    return replace(batch, seen=seen, bare=bare, context=context)
 
 
 @dataclass(frozen=True)
@@ -244,7 +239,7 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
     if sampling.start_crop:
         late = min(int(rng.uniform(0, sampling.start_crop) * length), length - 3)
         start, length = start + late, length - late
-    end = length - 1
+    end, goal = length - 1, start + length - 1
     first, last = target_times(end, sampling.margin, sampling.forward)
     times = np.arange(first, last + 1)
     if sampling.fraction is not None:
@@ -253,7 +248,6 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
         times = np.append(fixed, others if len(others) or not sampling.num_others else fixed)
     elif sampling.num_targets and len(times) > sampling.num_targets:
         times = np.sort(rng.choice(times, sampling.num_targets, replace=False))
-    goal = start + end
     if (sampling.goal_picture != 'last'
             and uses_recorded_goal(store[i], sampling.goal_picture, rng)
             and start + length == available):
@@ -293,8 +287,7 @@ class Augmentation:
             order = np.tile(np.arange(3), (batch_size, 1))
         flips = rng.random(batch_size) < 0.5
         gain = 1 + brightness * rng.uniform(-1, 1, (batch_size, 3))
-        return cls(torch.from_numpy(flips), torch.from_numpy(order),
-                   torch.from_numpy(gain.astype(np.float32)))
+        return cls(*map(torch.from_numpy, (flips, order, gain.astype(np.float32))))
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> 'Augmentation':
         """Copy everything to a device."""

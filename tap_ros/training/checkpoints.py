@@ -60,6 +60,11 @@ class TrainingState(Generic[Trained]):
     best_score: float = math.inf
     best_step: int = 0
 
+    @property
+    def modules(self) -> dict[str, torch.nn.Module]:
+        """All networks, by their names in a checkpoint."""
+        return {'network': self.network, 'average': self.average, 'helpers': self.helpers}
+
     def note(self, score: float) -> None:
         """Keep the average if its score is the smallest so far."""
         if score < self.best_score:
@@ -131,14 +136,12 @@ def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     :param data_hash: of the recordings.
     :raises StorageError: if the disk is full; the checkpoint before stays.
     """
-    tensors = {f'network.{name}': value for name, value in state.network.state_dict().items()}
-    tensors |= {f'average.{name}': value for name, value in state.average.state_dict().items()}
-    tensors |= {f'helpers.{name}': value for name, value in state.helpers.state_dict().items()}
-    tensors |= {f'best.{name}': value for name, value in state.best.items()}
-    for k, optimizer in enumerate(state.optimizers):
-        for i, values in optimizer.state_dict()['state'].items():
-            tensors |= {f'optimizer.{k}.{i}.{name}': value for name, value in values.items()}
-    save_tensors(path, tensors, {
+    parts = {**{name: module.state_dict() for name, module in state.modules.items()},
+             'best': state.best, **{
+                 f'optimizer.{k}.{i}': values for k, optimizer in enumerate(state.optimizers)
+                 for i, values in optimizer.state_dict()['state'].items()}}
+    save_tensors(path, {f'{part}.{name}': value for part, values in parts.items()
+                        for name, value in values.items()}, {
         'kind': 'checkpoint', 'step': state.step, 'seconds': state.seconds,
         **({'best': [state.best_score, state.best_step]} if state.best else {}),
         'precision': state.precision, 'settings': settings, 'data_hash': data_hash})
@@ -161,41 +164,36 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     tensors, about = load_tensors(path)
     if about.get('kind') != 'checkpoint':
         raise WeightsError(f'{escaped(path)}: is no checkpoint; {_REMEDY}')
-    begun, settings = json.loads(json.dumps([about['settings'], settings]))  # no tuples
+    begun, settings = about['settings'], json.loads(json.dumps(settings))  # no tuples
     if begun.keys() != settings.keys():
         raise ConfigError(f'{escaped(path)}: made by another version of tap_ros, which has other '
                           'settings; go on with that one, or choose another --out folder')
-    for name, value in settings.items():
-        before = begun[name]
-        if name not in FREE and before != value:
+    for name in settings:
+        if name not in FREE and begun[name] != settings[name]:
             raise ConfigError(
-                f'{escaped(path)}: made with {name}={escaped(repr(before))}, not {value!r}; to go '
-                'on with it give the same settings, else choose another --out folder')
+                f'{escaped(path)}: made with {name}={escaped(repr(begun[name]))}, not '
+                f'{settings[name]!r}; to go on with it give the same settings, else choose '
+                'another --out folder')
     if about.get('data_hash') != data_hash:
         raise ConfigError(f'{escaped(path)}: made from other recordings or marks; to go on with '
                           'it give the same in the same order, else choose another --out folder')
     try:
-        _put_back(state, tensors)
+        # Put them back into networks and optimizers.
+        for part, module in state.modules.items():
+            module.load_state_dict({name.removeprefix(f'{part}.'): value for name, value
+                                    in tensors.items() if name.startswith(f'{part}.')})
+        state.best = {name: tensors[f'best.{name}'].clone() for name in state.average.state_dict()
+                      if f'best.{name}' in tensors}
+        for name, value in tensors.items():
+            if name.startswith('optimizer.'):
+                _, k, i, part = name.split('.')
+                weight = state.optimizers[int(k)].param_groups[0]['params'][int(i)]
+                # The fused Adam wants the weight's own strides.
+                state.optimizers[int(k)].state[weight][part] = torch.empty_like(weight).copy_(
+                    value) if value.shape == weight.shape else value.to(weight.device)
     except (LookupError, RuntimeError, TypeError, ValueError) as error:
         raise WeightsError(f'{escaped(path)}: is a checkpoint of something else '
                            f'({escaped(error)}); {_REMEDY}') from error
     state.step, state.seconds = about['step'], about['seconds']
     state.precision = about['precision']
     state.best_score, state.best_step = about.get('best', (math.inf, 0))
-
-
-def _put_back(state: TrainingState[Any], tensors: Mapping[str, torch.Tensor]) -> None:
-    """Put tensors of a checkpoint back into networks and optimizers."""
-    for prefix, module in (('network.', state.network), ('average.', state.average),
-                           ('helpers.', state.helpers)):
-        module.load_state_dict({name[len(prefix):]: value for name, value in tensors.items()
-                                if name.startswith(prefix)})
-    state.best = {name: tensors[f'best.{name}'].clone() for name in state.average.state_dict()
-                  if f'best.{name}' in tensors}
-    for k, optimizer in enumerate(state.optimizers):
-        for i, weight in enumerate(optimizer.param_groups[0]['params']):
-            for name in [name for name in tensors if name.startswith(f'optimizer.{k}.{i}.')]:
-                value = tensors[name].to(weight.device)
-                if value.shape == weight.shape:  # the fused Adam wants the weight's own strides
-                    value = torch.empty_like(weight).copy_(value)
-                optimizer.state[weight][name.rsplit('.', 1)[1]] = value

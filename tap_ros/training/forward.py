@@ -7,7 +7,7 @@ Everything random is drawn from (seed, step), so that a run that was interrupted
 same result.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 import sys
 
@@ -30,13 +30,14 @@ from tap_ros.training.forward_loss import (
     Windows,
 )
 from tap_ros.training.forward_scores import held_out_scores
-from tap_ros.training.inpainted import Episodes, FilledStore
+from tap_ros.training.frames import Episodes, FilledStore
 from tap_ros.training.run import Run
 from tap_ros.weights import FORWARD_MODEL
 import torch
 
 AVERAGE_DECAY = 0.995  # of the moving average that is shipped
 HORIZON = 8  # control periods of the longest windows
+PICTURES = 4  # compared per window
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
 MOST_MISSED = 3 / 64  # of the picture's side, by which the arm may be beside its fit
 
@@ -56,8 +57,10 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
         episodes: Episodes = run.store if config.robot_mask == 'none' else FilledStore(
             run.store, config.robot_mask, progress, fill_from_past)
         draw = partial(draw_step, config, episodes, run.training, state.network.homography.cpu())
-        for _, (windows, shown) in run.steps(draw, partial(_score, run, episodes)):
-            loss, parts = forward_loss(state.network, windows.to(run.device), shown)
+        score = partial(held_out_scores, state.average, episodes, run.held_out)
+        show = partial(sample_grid, state.average, episodes)
+        for _, (windows, compared) in run.steps(draw, score, show):
+            loss, parts = forward_loss(state.network, windows.to(run.device), compared)
             state.optimizers[0].zero_grad()
             loss.backward()
             norm = state.clip_gradients()
@@ -137,15 +140,7 @@ def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarr
     length = round(2 + growth * (HORIZON - 2))
     cuts = Cuts.draw(store, training, config.batch_size, length, rng)
     return (make_windows(store, cuts, homography, config.robot_mask),
-            set((rng.permutation(length)[:config.pictures] + 1).tolist()))
-
-
-def _score(run: Run[ForwardTrainingConfig], episodes: Episodes,
-           ) -> tuple[Mapping[str, float], Mapping[str, np.ndarray]]:
-    """Score the averaged model; show some windows of all."""
-    model, parts = run.state.average, {'training': run.training, 'held_out': run.held_out}
-    return held_out_scores(model, episodes, run.held_out), {
-        name: sample_grid(model, episodes, part) for name, part in parts.items() if len(part)}
+            set((rng.permutation(length)[:PICTURES] + 1).tolist()))
 
 
 @torch.no_grad()

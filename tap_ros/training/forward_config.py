@@ -4,7 +4,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-import math
 
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import Folder
@@ -18,7 +17,6 @@ class ForwardTrainingConfig(RunConfig):
     All that a training of the forward model is made from; the defaults are the shipped one's.
 
     :param grow: share of the steps over which windows grow from 2 periods to their full length.
-    :param pictures: pictures compared per window.
     :param robot_mask: what the recordings' robot masks take out of the pictures: 'none'; the arm
         with its shadow ('arm'); the hand, too ('all'). What was seen there free last takes its
         place in the picture that is looked at; no error counts there.
@@ -34,14 +32,13 @@ class ForwardTrainingConfig(RunConfig):
     batch_size: int = 16
     learning_rate: float = 2e-3
     grow: float = 0.4
-    pictures: int = 4
     robot_mask: RobotMask = 'none'
     projection: tuple[float, ...] = ()
     initial_weights: str = ''
 
     def check(self, ranges: Mapping[str, tuple[float, float]] | None = None) -> None:
         """Raise ConfigError for settings that cannot be trained with."""
-        super().check({'grow': (0, 1), 'pictures': (1, math.inf), **(ranges or {})})
+        super().check({'grow': (0, 1), **(ranges or {})})
         if len(self.projection) not in (0, 12) or self.projection and not self.projection[-1]:
             raise ConfigError('projection: expected 12 numbers, the last one not 0, got '
                               f'{len(self.projection)}')

@@ -21,7 +21,7 @@ import torch
 from torch.nn import functional as F
 
 if TYPE_CHECKING:
-    from tap_ros.training.inpainted import Episodes
+    from tap_ros.training.frames import Episodes
 
 COLOUR_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 MOTION_FACTOR = 8.0  # extra weight of pixels that changed since the window's first picture
@@ -85,17 +85,14 @@ def make_windows(store: 'Episodes', cuts: Cuts, homography: torch.Tensor,
     :return: Windows; the grippers and actions of mirrored ones have x negated.
     :raises RecordingError: where gripper positions are missing.
     """
-    images, grippers, actions, hidden = [], [], [], []
+    rows = []
     for i, start in zip(cuts.episodes, cuts.starts):
         episode, part = store[int(i)], slice(start, start + cuts.steps + 1)
-        images.append(episode.frames[part])
-        grippers.append(episode.grippers[part])
-        actions.append(episode.actions[start:start + cuts.steps])
-        if robot_mask == 'none' or episode.robot_masks is None:
-            hidden.append(np.zeros(images[-1].shape[:-1], bool))
-        else:
-            hidden.append(hidden_pixels(episode.robot_masks[part], robot_mask))
-    hands = np.stack(grippers).astype(np.float32)
+        frames, masks = episode.frames[part], episode.robot_masks
+        rows.append((frames, episode.grippers[part], episode.actions[start:start + cuts.steps],
+                     np.zeros(frames.shape[:-1], bool) if masks is None
+                     else hidden_pixels(masks[part], robot_mask)))
+    images, hands, actions, hidden = map(np.stack, zip(*rows))
     if not np.isfinite(hands).all():
         bad = int(np.asarray(cuts.episodes)[~np.isfinite(hands).all((1, 2))][0])
         raise RecordingError(
@@ -103,12 +100,11 @@ def make_windows(store: 'Episodes', cuts: Cuts, homography: torch.Tensor,
             f'{", ".join(GRIPPER_JOINTS)} at every picture')
     B = len(images)
     batch = Windows(
-        to_float(np.stack(images)), torch.from_numpy(np.stack(hidden)[:, :, None]),
-        torch.from_numpy(hands), torch.from_numpy(np.stack(actions).astype(np.float32)),
+        to_float(images), torch.from_numpy(hidden[:, :, None]),
+        torch.from_numpy(hands.astype(np.float32)), torch.from_numpy(actions.astype(np.float32)),
         homography.expand(B, 3, 3).clone(), torch.from_numpy(np.full(B, cuts.mirrored)),
         torch.tensor(COLOUR_ORDERS)[np.full(B, cuts.orders)])
-    batch.images = recolour(batch.images, batch.colours[:, None])
-    batch.images = mirror(batch.images, batch.mirrored)
+    batch.images = mirror(recolour(batch.images, batch.colours[:, None]), batch.mirrored)
     batch.hidden = mirror(batch.hidden, batch.mirrored)
     batch.grippers[batch.mirrored, :, 0] *= -1
     batch.actions[batch.mirrored, :, 0] *= -1

@@ -12,7 +12,7 @@ from tap_ros.training.forward_loss import Cuts, make_windows, MOTION_THRESHOLD
 import torch
 
 if TYPE_CHECKING:
-    from tap_ros.training.inpainted import Episodes
+    from tap_ros.training.frames import Episodes
 
 SCORED_STEPS = (1, 5, 10, 15)
 STRIDE = 8  # frames from one window's start to the next
@@ -29,12 +29,10 @@ def held_out_scores(model: LearnedForwardModel, store: 'Episodes',
         so on, and `moved_{t}`, how many those are; without object pixels those of
         measure_pictures, `picture_l1_{t}` and so on.
     """
-    scores = {}
-    for t, measured in measure_maps(model, store, episodes).items():
-        for name, values in measured.items():
-            scores[f'{name}_px_{t}'] = float(values.mean())
-        scores[f'moved_{t}'] = len(values)
-    return scores or {
+    maps = measure_maps(model, store, episodes)
+    return {f'{name}_px_{t}': float(values.mean()) for t, measured in maps.items()
+            for name, values in measured.items()} | {
+        f'moved_{t}': len(measured['map_error']) for t, measured in maps.items()} or {
         f'{name}_l1_{t}': float(np.nanmean(values))
         for t, measured in measure_pictures(model, store, episodes).items()
         for name, values in measured.items() if np.isfinite(values).any()}

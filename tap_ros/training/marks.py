@@ -38,36 +38,28 @@ def episode_preferences(
     Compute the preference w(t) that a training needs, by stillness or learned from marks.
 
     :param training: indices of the episodes to train on.
-    :return: w of each episode, see prefer, None if it follows from the time; and what the weights
-        file tells of the marks.
+    :return: w of each episode, float32 (levels, T), 1 in those too short for targets; None if it
+        follows from the time. And what the weights file tells of the marks.
     """
+    about: dict[str, Any] = {}
     if config.selection == 'still':
-        return prefer(store, [still] * config.recursion, config.robot_mask), {}
-    if not config.marks:
-        return None, {}
-    marks = read_marks(config.marks, store)
-    preferences, about = learn_marks(
-        store, marks, training, config.recursion, config.forward, config.robot_mask)
-    print_marks_report(about)
-    return prefer(store, preferences, config.robot_mask), {'marks': {
-        'sha256': marks.digest, 'levels': about,
-        'preferences': [preference.to_json() for preference in preferences]}}
-
-
-def prefer(store: 'EpisodeStore', preferences: Sequence[Callable[[np.ndarray], np.ndarray]],
-           robot_mask: RobotMask) -> list[np.ndarray]:
-    """
-    Compute preferences w(t) in every episode.
-
-    :param preferences: of each level of recursion a function of features (T, SIZE) to w (T,).
-    :return: w of each episode, float32 (levels, T); 1 in those too short for targets.
-    """
+        preferences: Sequence[Callable[[np.ndarray], np.ndarray]] = [still] * config.recursion
+    elif config.marks:
+        marks = read_marks(config.marks, store)
+        learned, levels = learn_marks(
+            store, marks, training, config.recursion, config.forward, config.robot_mask)
+        print_marks_report(levels)
+        about = {'marks': {'sha256': marks.digest, 'levels': levels, 'preferences': [
+            preference.to_json() for preference in learned]}}
+        preferences = learned
+    else:
+        return None, about
     found = [np.ones((len(preferences), T), np.float32) for T in store.lengths]
     for i, w in enumerate(found):
         if w.shape[1] >= LEAST_FRAMES:
-            features = features_of(store, i, robot_mask)
+            features = features_of(store, i, config.robot_mask)
             w[:] = [preference(features) for preference in preferences]
-    return found
+    return found, about
 
 
 def learn_marks(store: 'EpisodeStore', marks: Marks, training: np.ndarray, levels: int,

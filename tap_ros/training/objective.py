@@ -112,18 +112,21 @@ class Outcome:
     """
     The loss of a batch and what it came from.
 
-    :param loss: scalar with gradient.
     :param match: int64 (B,), the matched targets as indices into T.
-    :param parts: dict of the terms of the loss, scalars without gradient.
+    :param parts: dict of the terms of the loss, scalars with gradient.
     :param judged: what the discriminators learn from, or None (see discriminators_loss).
-    :param nats: KL divergence of z, mean over the batch, without gradient; None without z.
+    :param nats: KL divergence of z, mean over the batch; None without z.
     """
 
-    loss: torch.Tensor
     match: torch.Tensor
     parts: dict[str, torch.Tensor]
     judged: Judged | None = None
     nats: torch.Tensor | None = None
+
+    @property
+    def loss(self) -> torch.Tensor:
+        """The sum of its terms, scalar with gradient."""
+        return total(self.parts.values())
 
 
 def predictor_loss(networks: Networks, batch: Batch, config: TrainingConfig,
@@ -142,7 +145,7 @@ def predictor_loss(networks: Networks, batch: Batch, config: TrainingConfig,
     out of the choice.
 
     :param draws: needed with GAN or VAE.
-    :param kl_share: of the weight of the KL divergence at this step, see training.kl_share.
+    :param kl_share: of the weight of the KL divergence at this step, see predictor.kl_share.
     :return: Outcome.
     """
     targets = Targets(batch, config)
@@ -166,15 +169,13 @@ def predictor_loss(networks: Networks, batch: Batch, config: TrainingConfig,
         assert draws is not None, "t' is drawn"
         judged = _judge(networks, targets, prediction, match, draws)
         with networks.autocast():
-            verdicts = [judge(judged.context, image) for judge, image in judged.pairs]
-        parts['gan'] = GAN_WEIGHT * total(
-            generator_loss(logits, judged.step) for logits in verdicts)
+            parts['gan'] = GAN_WEIGHT * total(
+                generator_loss(judge(judged.context, image), judged.step)
+                for judge, image in judged.pairs)
     if config.recursion > 1:
         parts['error'] = _recursive_loss(
             networks, targets, prediction, match, parts['error'], z)
-    return Outcome(total(parts.values()), match,
-                   {name: value.detach() for name, value in parts.items()}, judged,
-                   None if nats is None else nats.detach())
+    return Outcome(match, parts, judged, nats)
 
 
 def _judge(networks: Networks, targets: Targets, prediction: Prediction, match: torch.Tensor,
@@ -263,25 +264,20 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, draws: Draws,
     genmin the selection error is that of the whole loss instead of the l1 error.
     """
     batch = targets.batch
-    B, T = batch.times.shape
     assert networks.recognition is not None
-    divergences, errors = [], []
-    for t in range(T):
+    terms = []
+    for t in range(batch.times.shape[1]):
         step = torch.full_like(targets.rows, t)
-        frame = targets.frame(step)
         with networks.autocast():
             mean, log_variance = networks.recognition(
-                torch.cat([targets.context, frame[:, None]], 1))
+                torch.cat([targets.context, targets.frame(step)[:, None]], 1))
             z = sample_latent(mean, log_variance, draws.posterior[:, t])
-        prediction = networks.predict(targets.context, z)
-        divergences.append(kl_divergence(mean, log_variance))
-        errors.append(targets.l1(prediction.image, step))
-    divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
+        terms.append((kl_divergence(mean, log_variance),
+                      targets.l1(networks.predict(targets.context, z).image, step)))
+    divergences, errors = (torch.stack(values, 1) for values in zip(*terms))  # B, T
     whole = (kl_weight * divergences + errors).detach()
     match = match_step(selection_errors(
         whole, lambda: targets.errors(targets.measured), batch, targets.config), batch.valid)
     nats, error = (values.gather(1, match[:, None]).mean()
                    for values in (divergences, errors))
-    parts = {'kl': kl_weight * nats, 'error': error}
-    return Outcome(total(parts.values()), match,
-                   {name: value.detach() for name, value in parts.items()}, nats=nats.detach())
+    return Outcome(match, {'kl': kl_weight * nats, 'error': error}, nats=nats)

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training the predictor on recordings (section 3, appendix C)."""
 
-from collections.abc import Callable, Mapping
-import contextlib
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
@@ -25,8 +24,7 @@ from tap_ros.training.batches import (
     Pictures,
     Sampling,
 )
-from tap_ros.training.frames import MappedFrames, ResidentFrames
-from tap_ros.training.inpainted import fill
+from tap_ros.training.frames import FilledStore, ResidentFrames
 from tap_ros.training.marks import episode_preferences
 from tap_ros.training.objective import (
     discriminators_loss,
@@ -40,7 +38,7 @@ from tap_ros.training.predictor_config import TrainingConfig
 from tap_ros.training.run import Run
 from tap_ros.training.selection import Targets
 from tap_ros.training.training_networks import Discriminator, Recognition
-from tap_ros.weights.devices import Autocast, make_autocast, pick_precision
+from tap_ros.weights.devices import make_autocast, pick_precision
 import torch
 
 AVERAGE_DECAY = 0.999  # of the moving average that is shipped
@@ -68,41 +66,37 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
         state.precision = state.precision or pick_precision(config.precision, run.device)
         networks = Networks(state.network, **dict[str, Any](state.helpers.items()),
                             autocast=make_autocast(state.precision, run.device))
-        judges = [judge for judge in (networks.discriminator, networks.posterior_discriminator)
-                  if judge is not None]
-        # Decoding and copying would be most of the time of a step on a GPU.
-        make_frames = (partial(ResidentFrames, device=run.device, progress=progress)
-                       if run.device.type == 'cuda' else MappedFrames)
         preference, run.about = episode_preferences(run.store, config, run.training)
-        pictures = Pictures(make_frames(run.store), fill(
-            run.store, config.robot_mask, make_frames, progress), preference)
+        frames, filled = None, None if config.robot_mask == 'none' else FilledStore(
+            run.store, config.robot_mask, progress)
+        if run.device.type == 'cuda':  # decoding and copying would be most of the time of a step
+            frames = ResidentFrames(run.store, run.device, progress)
+            if filled is not None:
+                filled.gather = ResidentFrames(filled, run.device, progress)
+        pictures = Pictures(frames, filled, preference)
         draw = partial(draw_batch, run.store, run.training, config, pictures)
         state.network.train()
         state.helpers.train()
-        for step, batch in run.steps(draw, partial(_score, run, pictures), config.patience):
+        score, show = partial(_score, run, pictures), partial(_show, run, pictures)
+        for step, batch in run.steps(draw, score, show, config.patience):
             batch = batch.to(run.device)
 
             # Eqs. 1 to 10: the predictor, and the recognition network.
-            for judge in judges:
-                judge.requires_grad_(False)
             outcome = predictor_loss(networks, batch, config, Draws.make(batch, config.seed, step),
                                      kl_share(step, config.steps, config.kl_warmup))
             state.optimizers[0].zero_grad()
             outcome.loss.backward()
-            norm = state.clip_gradients()
+            shown = {**_values(outcome, batch), 'gradient_norm': state.clip_gradients()}
             state.optimizers[0].step()
 
             # Eq. 11: the discriminators.
             if outcome.judged is not None:
-                for judge in judges:
-                    judge.requires_grad_(True)
                 loss = discriminators_loss(outcome.judged, networks.autocast)
-                state.optimizers[1].zero_grad()
+                state.optimizers[1].zero_grad()  # of what the predictor's loss left there, too
                 loss.backward()
                 state.optimizers[1].step()
-                outcome.parts['discriminators'] = loss.detach()
-
-            run.show({**_values(outcome, batch), 'gradient_norm': norm})
+                shown['loss_discriminators'] = loss.detach()
+            run.show(shown)
     return run.weights
 
 
@@ -158,64 +152,50 @@ def draw_batch(store: EpisodeStore, episodes: np.ndarray, config: TrainingConfig
 def _values(outcome: Outcome, batch: Batch) -> dict[str, torch.Tensor]:
     """Return what the curves show of a step, by name."""
     fraction = batch.times.gather(1, outcome.match[:, None]) / batch.end
-    return {'loss': outcome.loss.detach(), 'match_fraction': fraction.mean(),
-            'match_fraction_std': fraction.std(correction=0),
-            **{f'loss_{name}': value for name, value in outcome.parts.items()},
-            **({} if outcome.nats is None else {'nats': outcome.nats})}
+    values = {'loss': outcome.loss, 'match_fraction': fraction.mean(),
+              'match_fraction_std': fraction.std(correction=0),
+              **{f'loss_{name}': value for name, value in outcome.parts.items()},
+              **({} if outcome.nats is None else {'nats': outcome.nats})}
+    return {name: value.detach() for name, value in values.items()}
 
 
-def _score(run: Run[TrainingConfig], pictures: Pictures,
-           ) -> tuple[Mapping[str, float], Mapping[str, np.ndarray]]:
-    """Score the averaged network, z at 0, where its method matches; show some of all."""
-    config, held_out, network = run.config, run.held_out, run.state.average
-    autocast = make_autocast(run.state.precision, run.device)
-    sampling = Sampling(
+def _score(run: Run[TrainingConfig], pictures: Pictures) -> dict[str, float]:
+    """Score the averaged network on the held-out episodes, where its method matches."""
+    rows = []
+    for i in range(0, len(run.held_out), 64):
+        batch, prediction, match = _matched(run, pictures, run.held_out[i:i + 64])
+        frame = to_float(batch.targets[torch.arange(len(match), device=match.device), match])
+        image = batch.visible(prediction.image[:, None])[:, 0]
+        rows.append(torch.stack([
+            l1_error(image, frame), l1_error(to_float(batch.measured), frame[:, None]).amin(1),
+            (batch.times.gather(1, match[:, None]) / batch.end)[:, 0]]).cpu())
+    if not rows:
+        return {}
+    error, copying, share = torch.cat(rows, 1)
+    return {name: score.item() for name, score in {
+        'loss': error.mean(), 'relative': error.mean() / copying.mean(),
+        'match_fraction': share.mean(), 'match_fraction_std': share.std(correction=0)}.items()}
+
+
+@torch.no_grad()
+def _matched(run: Run[TrainingConfig], pictures: Pictures,
+             episodes: np.ndarray) -> tuple[Batch, Prediction, torch.Tensor]:
+    """Predict with the averaged network, z at 0; find the frames (B,) that its method chooses."""
+    config = run.config
+    batch = make_batch(run.store, episodes, Sampling(
         config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
-        forward=config.forward, fraction=config.only_fraction, fill_context=config.fill_context)
-
-    def gather(episodes: np.ndarray) -> Batch:
-        return make_batch(run.store, episodes, sampling, pictures=pictures).to(run.device)
-
-    scores, shown, losses, copied, fractions = {}, {}, [], [], []
-    for i in range(0, len(held_out), 64):
-        part = gather(held_out[i:i + 64])
-        prediction, match = matched(network, part, config, autocast)
-        frame = to_float(part.targets[torch.arange(len(match), device=match.device), match])
-        image = part.visible(prediction.image[:, None])[:, 0]
-        losses.append(l1_error(image, frame).cpu())
-        copied.append(l1_error(to_float(part.measured), frame[:, None]).amin(1).cpu())
-        fractions.append((part.times.gather(1, match[:, None]) / part.end)[:, 0].cpu())
-    if losses:
-        shares = torch.cat(fractions)
-        loss = torch.cat(losses).mean()
-        scores = {'loss': loss.item(), 'relative': (loss / torch.cat(copied).mean()).item(),
-                  'match_fraction': shares.mean().item(),
-                  'match_fraction_std': shares.std(correction=0).item()}
-    for name, episodes in (('training', run.training), ('held_out', held_out)):
-        if len(episodes):
-            some = gather(episodes[:_SHOWN])
-            shown[name] = sample_grid(some, *matched(network, some, config, autocast))
-    return scores, shown
-
-
-@torch.no_grad()
-def matched(network: PredictorNetwork, batch: Batch, config: TrainingConfig,
-            autocast: Autocast = contextlib.nullcontext) -> tuple[Prediction, torch.Tensor]:
-    """
-    Predict, with z at 0, and find the frames that the method chooses.
-
-    :param network: PredictorNetwork in eval mode.
-    :param batch: batches.Batch, on the network's device.
-    :param autocast: makes the context manager to run the network in.
-    :return: (Prediction, int64 (B,) indices into T).
-    """
+        forward=config.forward, fraction=config.only_fraction,
+        fill_context=config.fill_context), pictures=pictures).to(run.device)
     targets = Targets(batch, config)
-    with autocast():
-        prediction = network(targets.context)
-    return prediction, targets.match(prediction.image, targets.measured)
+    with make_autocast(run.state.precision, run.device)():
+        prediction = run.state.average(targets.context)
+    return batch, prediction, targets.match(prediction.image, targets.measured)
 
 
-@torch.no_grad()
+def _show(run: Run[TrainingConfig], pictures: Pictures, episodes: np.ndarray) -> np.ndarray:
+    return sample_grid(*_matched(run, pictures, episodes[:_SHOWN]))
+
+
 def sample_grid(batch: Batch, prediction: Prediction, match: torch.Tensor) -> np.ndarray:
     """
     Show a batch: context, prediction, matched frame, one mask for each source, new pixels.
@@ -224,17 +204,11 @@ def sample_grid(batch: Batch, prediction: Prediction, match: torch.Tensor) -> np
     :param match: int64 (B,), the matched targets as indices into T.
     :return: uint8 (height, width, 3).
     """
-    context = batch.context.cpu().numpy()
-    images = to_uint8(prediction.image)
-    match = match.cpu()
-    rows = []
-    for b in range(len(context)):
-        row = [*context[b], images[b], batch.targets[b, match[b]].cpu().numpy()]
-        row += grey_panels(prediction.masks[b, :, 0].float())
-        if prediction.new_pixels is not None:
-            row.append(to_uint8(prediction.new_pixels[b]))
-        rows.append(row)
-    return grid(rows)
+    context, images = batch.context.cpu().numpy(), to_uint8(prediction.image)
+    new = prediction.new_pixels
+    return grid([[*context[b], images[b], batch.targets[b, step].cpu().numpy(),
+                  *grey_panels(prediction.masks[b, :, 0].float()),
+                  *([] if new is None else [to_uint8(new[b])])] for b, step in enumerate(match)])
 
 
 def kl_share(step: int, steps: int, warmup: float) -> float:

@@ -10,9 +10,12 @@ from typing import Literal
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import Folder
 from tap_ros.images.robot_mask import RobotMask
-from tap_ros.training.methods import Latent, Loss, method_name, Mode, Selection
 from tap_ros.training.run_config import RunConfig
 
+Mode = Literal['bidirectional', 'forward']  # contract.MODES
+Loss = Literal['fix', 'min', 'genmin']
+Selection = Literal['absolute', 'relative', 'progress', 'still', 'marks']
+Latent = Literal['none', 'vae']
 GoalPicture = Literal['last', 'recorded', 'mixed']
 Posterior = Literal['video', 'frame']
 Precision = Literal['auto', 'float32', 'bfloat16']
@@ -125,9 +128,17 @@ class TrainingConfig(RunConfig):
 
     @property
     def method(self) -> str:
-        """The name of the method in the paper's tables."""
-        return method_name(self.loss, self.selection, self.gan, self.latent, self.fraction,
-                           self.beta if self.forward else None)
+        """
+        The name of the method in the paper's tables, such as 'fix0.25' or 'genmin-vae-gan'.
+
+        As there, fix, min and genmin alone are trained with l1 and GAN, -wo-gan by l1 only.
+        """
+        number = {'fix': '' if self.fraction == 0.5 else f'{self.fraction:g}',
+                  'genmin': f'{self.beta:g}' if self.forward else ''}.get(self.loss, '')
+        model = '-vae' + '-gan' * self.gan if self.latent == 'vae' else '-wo-gan' * (not self.gan)
+        chosen = f'+{self.selection}' if self.selection == 'marks' or (
+            self.loss == 'genmin' and self.selection != 'absolute') else ''
+        return f'{self.loss}{number}{model}{chosen}'
 
     @property
     def only_fraction(self) -> float | None:
@@ -142,27 +153,27 @@ class TrainingConfig(RunConfig):
     def check(self, ranges: Mapping[str, tuple[float, float]] | None = None) -> None:
         """Raise ConfigError for settings that cannot be trained with, or that do nothing."""
         super().check({**_RANGES, **(ranges or {})})
-        for wrong, advice in (
-                (self.forward and self.loss == 'genmin' and self.selection == 'progress',
-                 'selection: progress needs a goal picture; with mode forward choose absolute'),
-                ((self.selection == 'marks') != bool(self.marks) or (
-                    self.marks and self.loss == 'min'),
-                 'marks: they go with loss genmin or fix and selection marks; give both options '
-                 'or none'),
-                (self.recursion > 1 and self.loss == 'fix',
-                 'recursion: the targets of Eq. 3 follow the match; expected 1 with loss fix'),
-                (self.posterior == 'frame' and (
-                    self.latent == 'none' or self.gan or self.recursion > 1 or self.free_nats),
-                 "posterior: 'frame' goes with latent vae, without GAN, recursion and free_nats"),
-                (self.skips and self.decoder != 'shared',
-                 "skips: they go with decoder 'shared'"),
-                (self.fill_context and self.robot_mask == 'none',
-                 'fill_context: nothing is known of the robot; choose robot_mask arm or all'),
-                *((self.latent == 'none' and getattr(self, name) != getattr(TrainingConfig, name),
-                   f'{name}: only z has it; choose latent vae, or leave {name} out')
-                  for name in ('free_nats', 'kl_warmup', 'posterior_std'))):
-            if wrong:
-                raise ConfigError(advice)
+        if self.forward and self.loss == 'genmin' and self.selection == 'progress':
+            raise ConfigError('selection: progress needs a goal picture; with mode forward choose '
+                              'absolute')
+        if (self.selection == 'marks') != bool(self.marks) or (self.marks and self.loss == 'min'):
+            raise ConfigError('marks: they go with loss genmin or fix and selection marks; give '
+                              'both options or none')
+        if self.recursion > 1 and self.loss == 'fix':
+            raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
+                              'loss fix')
+        if self.posterior == 'frame' and (
+                self.latent == 'none' or self.gan or self.recursion > 1 or self.free_nats):
+            raise ConfigError("posterior: 'frame' goes with latent vae, without GAN, recursion "
+                              'and free_nats')
+        if self.skips and self.decoder != 'shared':
+            raise ConfigError("skips: they go with decoder 'shared'")
+        if self.fill_context and self.robot_mask == 'none':
+            raise ConfigError('fill_context: nothing is known of the robot; choose robot_mask arm '
+                              'or all')
+        for name in ('free_nats', 'kl_warmup', 'posterior_std'):
+            if self.latent == 'none' and getattr(self, name) != getattr(TrainingConfig, name):
+                raise ConfigError(f'{name}: only z has it; choose latent vae, or leave {name} out')
 
 
 _PUSH = TrainingConfig(recordings=())

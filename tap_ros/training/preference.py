@@ -200,7 +200,6 @@ def _small(grey: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
 
 
 def _softmax(logits: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the softmax, and the logarithm of the sum of exponentials."""
     largest = logits.max()
     share = np.exp(logits - largest)
     return share / share.sum(), float(largest + np.log(share.sum()))

@@ -19,13 +19,13 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
-from tap_ros.recording.bags import check_first_picture, find_bags
+from tap_ros.recording.bags import find_bags
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import reading_of
+from tap_ros.recording.topic_choice import Bag
 from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
-from tap_ros.training.inpainted import with_masks
 from tap_ros.training.run_config import RunConfig
-from tap_ros.training.split import split_episodes, warn_if_few
+from tap_ros.training.split import split_episodes, warn_if_few, with_masks
 from tap_ros.weights.devices import pick_device
 from tap_ros.weights.weights import save_weights
 import torch
@@ -35,8 +35,7 @@ from tqdm import tqdm
 Trained = TypeVar('Trained', bound=torch.nn.Module)
 Item = TypeVar('Item')  # what a step takes
 Config = TypeVar('Config', bound=RunConfig)
-# Scores by name, and pictures (H, W, 3).
-Score = Callable[[], tuple[Mapping[str, float], Mapping[str, np.ndarray]]]
+Show = Callable[[np.ndarray], np.ndarray]  # from indices of episodes to a picture (H, W, 3)
 
 
 class Run(Generic[Config]):
@@ -45,7 +44,7 @@ class Run(Generic[Config]):
 
         with Run(config, 'predictor') as run:
             state = run.begin(network, average_decay)
-            for step, item in run.steps(draw, score):
+            for step, item in run.steps(draw, score, show):
                 ...  # moves state.network by state.optimizers
                 run.show({'loss': loss})
 
@@ -86,24 +85,22 @@ class Run(Generic[Config]):
         self.device = pick_device(config.device)
         if config.threads:
             torch.set_num_threads(config.threads)
-        reading = reading_of(config)
-        paths = paths_of(config)
-        check_first_picture(paths, reading, f'the {self.kind.replace("_", " ")}')
-        self.store = open_recordings(paths, progress=self.progress, reading=reading)
-        with ExitStack() as stack:
-            stack.enter_context(_run_folder(config.out))
-            self.training, self.held_out = with_masks(self.store, split_episodes(
-                self.store, config.test_fraction, self._min_frames, config.held_out),
-                config.robot_mask)
-            if not len(self.training):
-                raise RecordingError('recordings: all that --held-out leaves is too short to '
-                                     'train on; name others')
-            if config.held_out and not len(self.held_out):
-                raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
-                                     'by itself; name whole bags, not files of a split one')
-            warn_if_few(self.held_out)
-            torch.manual_seed(config.seed)
-            self._stack = stack.pop_all()
+        self.store = open_recordings(
+            bags_of(config), progress=self.progress, reading=reading_of(config),
+            network=f'the {self.kind.replace("_", " ")}')
+        self.training, self.held_out = with_masks(self.store, split_episodes(
+            self.store, config.test_fraction, self._min_frames, config.held_out),
+            config.robot_mask)
+        if not len(self.training):
+            raise RecordingError('recordings: all that --held-out leaves is too short to '
+                                 'train on; name others')
+        if config.held_out and not len(self.held_out):
+            raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
+                                 'by itself; name whole bags, not files of a split one')
+        warn_if_few(self.held_out)
+        torch.manual_seed(config.seed)
+        self._stack = ExitStack()
+        self._stack.enter_context(_run_folder(config.out))
         return self
 
     def __exit__(self, *error: Any) -> bool | None:
@@ -131,24 +128,24 @@ class Run(Generic[Config]):
         """Show numbers of a step in the curves, the first two on the progress bar."""
         self._shown = values
 
-    def steps(self, draw: Callable[[int], Item], score: Score,
-              patience: int = 0) -> Iterator[tuple[int, Item]]:
+    def steps(self, draw: Callable[[int], Item], score: Callable[[], Mapping[str, float]],
+              show: Show, patience: int = 0) -> Iterator[tuple[int, Item]]:
         """
         Yield the number of each step and what it takes; after it show, score and save.
 
         :param draw: makes what a step takes from its number, two steps ahead in another thread.
-        :param score: scores the averaged network, and shows what it does.
+        :param score: scores the averaged network on the held-out episodes.
+        :param show: draws what it does in some of those that it is given.
         :param patience: steps after which the run ends if the score 'relative', of the held-out
             episodes, has not become smaller; the weights are then those with the smallest.
             0: never.
         :raises KeyboardInterrupt: after the step in which Ctrl-C was pressed, and all is saved.
         """
         config, state = self.config, self.state
-        interrupted = self._stack.enter_context(_first_interrupt())
-        curves = self._stack.enter_context(SummaryWriter(config.out, purge_step=state.step))
-        bar = self._stack.enter_context(tqdm(
-            total=config.steps, initial=state.step, unit='step', disable=not self.progress,
-            desc=self.kind.replace('_', ' ')))
+        interrupted, curves, bar = map(self._stack.enter_context, (
+            _first_interrupt(), SummaryWriter(config.out, purge_step=state.step),
+            tqdm(total=config.steps, initial=state.step, unit='step', disable=not self.progress,
+                 desc=self.kind.replace('_', ' '))))
         began = time.monotonic() - state.seconds
 
         def hopeless() -> bool:
@@ -163,16 +160,16 @@ class Run(Generic[Config]):
             # Tell and save.
             bar.update()
             if state.step % config.log_every == 0:
-                shown = {name: float(value) for name, value in self._shown.items()}
-                shown['learning_rate'] = state.optimizers[0].param_groups[0]['lr']
-                for name, value in shown.items():
+                rate = state.optimizers[0].param_groups[0]['lr']
+                for name, value in {**self._shown, 'learning_rate': rate}.items():
                     curves.add_scalar(f'train/{name}', value, state.step)
-                bar.set_postfix({name: f'{shown[name]:.4f}' for name in list(shown)[:2]})
+                bar.set_postfix({name: f'{float(self._shown[name]):.4f}'
+                                 for name in list(self._shown)[:2]})
             if self._after_step is not None:
                 self._after_step(state.step)
             at_end = state.step == config.steps
             if patience and (state.step % max(1, patience // 5) == 0 or at_end):
-                state.note(score()[0]['relative'])
+                state.note(score()['relative'])
                 if state.best and (hopeless() or at_end):
                     state.average.load_state_dict(state.best)
             stopped = interrupted.is_set() or hopeless()
@@ -180,7 +177,7 @@ class Run(Generic[Config]):
                 state.seconds = time.monotonic() - began
                 if patience:
                     self.about['best_step'] = state.best_step
-                self._report(score, curves)  # first: one killed in between reports again
+                self._report(score(), show, curves)  # first: one killed in between reports again
                 save_checkpoint(self.checkpoint, state, asdict(config), self._data_hash)
             if stopped:
                 break
@@ -189,14 +186,15 @@ class Run(Generic[Config]):
                        'command goes on from there', sys.stderr)
             raise KeyboardInterrupt
 
-    def _report(self, score: Score, curves: SummaryWriter) -> None:
+    def _report(self, scores: Mapping[str, float], show: Show, curves: SummaryWriter) -> None:
         """Write scores, sample pictures, what the run was, and the averaged weights."""
         config, state, store = self.config, self.state, self.store
-        scores, pictures = score()
+        settings = asdict(config)
         for name, value in scores.items():
             curves.add_scalar(f'held_out/{name}', value, state.step)
-        for name, picture in pictures.items():
-            curves.add_image(name, picture, state.step, dataformats='HWC')
+        for name, part in (('training', self.training), ('held_out', self.held_out)):
+            if len(part):
+                curves.add_image(name, show(part), state.step, dataformats='HWC')
         about = {
             **({'precision': state.precision} if state.precision else {}),
             'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
@@ -207,20 +205,18 @@ class Run(Generic[Config]):
                        + (torch.cuda.get_device_name(self.device)
                           if self.device.type == 'cuda' else self.device.type),
             'torch': torch.__version__, 'python': platform.python_version(), **self.about}
-        settings = asdict(config)
         for name, values in (('config', settings), ('run', about), ('scores', scores)):
             write_atomically(Path(config.out, f'{name}.json'), json.dumps(values, indent=2) + '\n')
         save_weights(self.weights, state.average, self.kind, state.network.config,
                      about | {'settings': settings, 'scores': scores})
 
 
-def paths_of(config: RunConfig) -> list[str]:
+def bags_of(config: RunConfig) -> list[Bag]:
     """Return the recordings, and of those held out what is not among them."""
-    def files(path: str) -> set[Path]:
-        return {file.resolve() for bag in find_bags(path) for file in bag}
-
-    known = set().union(*map(files, config.recordings))
-    return [*config.recordings, *(path for path in config.held_out if not files(path) <= known)]
+    bags = find_bags(config.recordings)
+    known = {file.resolve() for bag in bags for file in bag.files}
+    return bags + [bag for bag in find_bags(config.held_out)
+                   if not {file.resolve() for file in bag.files} <= known]
 
 
 def _drawn_ahead(draw: Callable[[int], Item], first: int, last: int) -> Iterator[tuple[int, Item]]:

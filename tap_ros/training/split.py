@@ -10,6 +10,8 @@ import zlib
 
 import numpy as np
 from tap_ros.base.errors import RecordingError
+from tap_ros.images.robot_mask import RobotMask
+from tap_ros.messages.topics import ROBOT_MASK
 from tap_ros.recording.episode import RecordingWarning
 
 if TYPE_CHECKING:
@@ -78,14 +80,36 @@ def _demonstrations(store: 'EpisodeStore', episodes: Sequence[int]) -> list[int]
     return found
 
 
+def with_masks(store: 'EpisodeStore', parts: tuple[np.ndarray, np.ndarray],
+               robot_mask: RobotMask) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Leave out the episodes that a robot mask cannot be used with.
+
+    :param parts: int64, indices of the episodes to train on and of those held out.
+    :param robot_mask: see robot_mask.hidden_pixels; with 'none' all of them stay.
+    :return: the same, with those whose frames all have a mask; a warning says how many have not.
+    :raises RecordingError: when none is left to train on.
+    """
+    if robot_mask == 'none':
+        return parts
+    training, held_out = (part[[store.has_masks(int(i)) for i in part]] for part in parts)
+    before, after = sum(map(len, parts)), len(training) + len(held_out)
+    if len(parts[0]) and not len(training):
+        raise RecordingError(
+            f'recordings: robot_mask {robot_mask} needs a robot mask for every picture of an '
+            f'episode, and {len(training)} of {len(parts[0])} to train on have them; record '
+            f'{ROBOT_MASK.recorded} beside the camera, or give --robot-mask none')
+    if after < before:
+        warnings.warn(
+            f'recordings: {before - after} of {before} episodes are left out, as not all of their '
+            'pictures have a robot mask', RecordingWarning, stacklevel=3)
+    return training, held_out
+
+
 def warn_if_few(held_out: np.ndarray) -> None:
-    """Say before a training that nothing will be measured, or that few episodes measure it."""
-    if not len(held_out):
-        warnings.warn('recordings: no episode is held out, so nothing is measured; record at '
-                      'least two, and give a --test-fraction above 0', RecordingWarning,
-                      stacklevel=3)
-    elif len(held_out) < FEW:
-        count = f'{len(held_out)} episode{"s are" if len(held_out) > 1 else " is"}'
+    """Say before a training that few episodes, or none, measure how good it is."""
+    if len(held_out) < FEW:
+        count = f'{len(held_out)} episode{" is" if len(held_out) == 1 else "s are"}'
         warnings.warn(f'recordings: only {count} held out, and scores of fewer than {FEW} say '
                       'little; record more, give a larger --test-fraction, or --held-out BAG',
                       RecordingWarning, stacklevel=3)

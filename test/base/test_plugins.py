@@ -58,7 +58,6 @@ def test_a_broken_arm_hinders_no_other():
 @pytest.mark.parametrize('words', [
     ['collect', '--task', 'push2', '--world', 'raises'],
     ['collect', '--task', 'push2', '--arm', 'raises'],
-    ['evaluate', 'tracking', '--recordings', 'bags/sample_push2', '--tracker', 'raises'],
     ['predict', 'start.png', 'goal.png', '--weights', 'raises:x'],
     ['evaluate', 'prediction', '--recordings', 'bags/sample_push2', '--weights', 'leaves:x']])
 def test_a_command_ends_with_one_line(words, tmp_path):

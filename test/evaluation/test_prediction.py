@@ -13,15 +13,11 @@ import cv2
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
-from tap_ros.apps import evaluate as command
+from tap_ros.apps.evaluate_prediction import Options, run
 from tap_ros.base.errors import ConfigError, ImageError
 from tap_ros.base.options import parse
-from tap_ros.evaluation.bottleneck import (
-    bottleneck_scores,
-    bottleneck_share,
-)
+from tap_ros.evaluation.bottleneck import bottleneck_scores
 from tap_ros.evaluation.intervals import bootstrap
-from tap_ros.evaluation.keyframes import nearest_frame
 from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
@@ -29,7 +25,7 @@ from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNe
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.marks import Marks, write_marks
+from tap_ros.recording.marks import write_marks
 from tap_ros.weights.weights import save_weights
 import torch
 
@@ -156,16 +152,6 @@ def test_a_verdict_is_of_the_matched_frame_and_memorised_is_said():
     assert 'too few' in verdict(few, None)[0] and len(verdict(few, good)) == 2
 
 
-def test_the_nearest_demonstration_is_another_one_and_a_marked_one_where_there_is():
-    same = [move_squares([[6, 6], [24, 16]], [[12, 10], [27, 7]], length=length)
-            for length in (9, 9, 17)]
-    store = Store([*same, move_squares([[8, 8], [20, 16]], [[14, 12], [25, 10]])])
-    for marked, others, frame in (({}, [0, 3], 8), ({}, [0, 2], 8), ({0: [(2, 2)]}, [0, 3], 4),
-                                  ({0: [(2, 2)], 1: [(3, 5)]}, [1], 8), ({2: [(4, 4)]}, [2, 1], 8),
-                                  ({2: [(1, 1)], 0: [(5, 7)]}, [0, 2, 3], 12)):
-        assert nearest_frame(store, 2, others, Marks(marked, '')) == pytest.approx(frame, abs=2)
-
-
 def test_copying_matches_the_frame_beside_it_and_is_no_bottleneck():
     scores = evaluate(Pasting(), EPISODES, range(3))
     assert scores['copy-start'].match_step.tolist() == [1, 1, 1]
@@ -217,14 +203,11 @@ def test_the_best_of_more_samples_is_never_worse_and_of_one_is_what_evaluate_mea
     assert (few.min_l1 <= one.min_l1 + 1e-7).all() and (more.min_l1 <= few.min_l1 + 1e-7).all()
     assert (more.min_l1 < one.min_l1).all()
     assert (one.spread == 0).all() and (more.spread > 0).all()
-    whole = more.spread
-    assert (np.minimum(more.spread_near, more.spread_elsewhere) <= whole).all()
-    assert (np.maximum(more.spread_near, more.spread_elsewhere) >= whole).all()
     assert np.isnan(more.spread_px).all()
 
 
 def score(words):
-    command.prediction(parse(command.Prediction, words))
+    run(parse(Options, words))
 
 
 @pytest.mark.parametrize(('crop', 'camera', 'told'), [
@@ -271,8 +254,7 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     assert 'positions: unknown' in shown and 'in 2 marked episodes' in shown
     scores = json.loads((tmp_path / 'out' / 'scores.json').read_text())['scores']
     hits = scores.pop('marks')
-    assert set(hits) == {'prediction', 'nearest demonstration', 'slowest', 'middle', 'UVD-like',
-                         'random'}
+    assert set(hits) == {'prediction', 'middle', 'random'}
     assert hits['middle'][0][0] == hits['middle'][1][0] == 0.5
     assert hits['random'][0][0] == pytest.approx((3 / 7 + 1 / 7) / 2)
     assert hits['random'][1][0] == pytest.approx((5 / 7 + 2 / 7) / 2)
@@ -285,7 +267,7 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     low, high = scores['prediction']['intervals']['min_l1']
     assert low <= scores['prediction']['min_l1'] <= high
     sheet = cv2.imread(str(tmp_path / 'out' / 'pictures.png'))
-    panels = 6 - ('num_context' in options) + ('new_pixels' not in options)
+    panels = 5 - ('num_context' in options) + ('new_pixels' not in options)
     assert sheet.shape == (20 + 3 * 130 - 2, panels * 130 - 2, 3)
 
 
@@ -296,21 +278,6 @@ def test_another_predictor_is_scored_by_what_it_shows_and_its_maps(tmp_path, cap
     scores = json.loads((out / 'scores.json').read_text())['scores']
     assert scores['prediction']['min_l1'] < 1e-6  # it has seen these episodes
     assert scores['prediction']['bottleneck_median'] < scores['copy-goal']['bottleneck_median'] / 2
-
-
-@pytest.mark.parametrize('home', [3, 5, 8])
-def test_the_bottleneck_is_when_one_object_is_home_and_the_others_untouched(home):
-    T, start, end = 11, np.array([[3.0, 3], [20, 20]]), np.array([[3.0, 12], [28, 20]])
-    pixels = np.tile(start, (T, 1, 1))
-    pixels[home:, 1] = end[1]  # seen from frame `home` on, until object 0 goes in the last one
-    pixels[-1, 0] = end[0]
-    episode = replace(EPISODES[0], object_pixels=pixels.astype(np.float32))
-    assert bottleneck_share(episode) == pytest.approx((home + 9) / 2 / (T - 1))
-    both = pixels.copy()
-    both[home:-1, 0] = (start[0] + end[0]) / 2  # neither untouched nor home
-    assert np.isnan(bottleneck_share(replace(episode, object_pixels=both.astype(np.float32))))
-    alone = replace(episode, object_pixels=pixels[:, :1].astype(np.float32))
-    assert np.isnan(bottleneck_share(alone))
 
 
 def test_differences_are_paired():

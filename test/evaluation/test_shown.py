@@ -6,9 +6,7 @@
 import cv2
 import numpy as np
 import pytest
-from sim_bridge.collect import make_episode
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.tasks import run_episode
 from tap_ros.evaluation.shown import ShownScorer
 from tap_ros.images.robot_mask import fill_in_time
 
@@ -17,9 +15,7 @@ CARRYING = 8  # a frame in which the hand is at the object
 
 @pytest.fixture(scope='module')
 def episode():
-    simulator = Simulator('pick_place', look='hand')
-    observations, actions, outcome = run_episode(simulator, 3)
-    return make_episode(simulator, observations, actions, outcome)
+    return Simulator('pick_place', look='hand').demonstrate(3).episode
 
 
 def test_the_matched_frame_shows_all_and_the_one_without_the_hand_no_hand(episode):

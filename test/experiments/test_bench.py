@@ -13,12 +13,12 @@ from tap_ros.planning.protocols import Problem, SearchConfig
 def test_all_frames_are_opened_beside_another_job(monkeypatch):
     monkeypatch.setattr(recording, 'JPEG_FRAMES', 20)
     args = recording.Options(episodes=2, files=1, repeats=1)
-    *ours, pictures = recording.measure(args)
+    *ours, pictures = recording.run(args)
     assert [row.ratio > 0 for row in ours] == [True, True]
     assert '20 JPEG frames' in pictures.what and pictures.reached
     monkeypatch.setattr(recording, '_build_cache', lambda paths, scratch: 1)
     with pytest.raises(RuntimeError, match='saw 1 of'):
-        recording.measure(args)
+        recording.run(args)
 
 
 def test_a_row_that_misses_its_aim_says_why():

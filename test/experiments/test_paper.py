@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 
 from experiments.paper import command, runs, sweep
+from experiments.paper.methods import method_fields
 from experiments.paper.recordings import RECORDINGS, SHIFTED
 from experiments.paper.results import load_runs, on_same_episodes
 from experiments.paper.rows import as_frame, group_runs, make_rows
@@ -19,7 +20,6 @@ import numpy as np
 import pytest
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import parse
-from tap_ros.training.methods import method_fields
 
 STORED = Path(__file__).parents[2] / 'docs' / 'results' / 'runs'
 SEEDS = (122, 142, *range(4), 6, 8)  # the first two are held out

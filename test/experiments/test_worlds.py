@@ -4,12 +4,14 @@
 
 import json
 
-from experiments.worlds import command
+from experiments.worlds import command, keyframes
+from experiments.worlds.ogbench import OGBench
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
+from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
+from tap_ros.base.engines import Engine
 from tap_ros.base.errors import ConfigError
-from tap_ros.evaluation import keyframes
 from tap_ros.recording.cache import open_recordings
 
 
@@ -54,3 +56,17 @@ def test_bottlenecks_are_read_by_their_stamps(tmp_path):
     found, = command.read(tmp_path / 'bag')
     assert len(found.frames) == 7 and (found.window, found.number) == ((2, 4), 1)
     assert found.frames.shape[1:] == (64, 64, 3)
+
+
+def test_oracles_of_ogbench_demonstrate_as_unsteadily_as_people_do(tmp_path):
+    pytest.importorskip('ogbench')
+    config = CollectConfig(world='ogbench', task='drawer', episodes=1, seed=2, image_size=32)
+    collect(tmp_path, config, Engine(workers=1), progress=False, make=OGBench)
+    episode, = open_recordings(tmp_path)
+    assert (episode.task, episode.outcome) == ('drawer', 'success')
+    world = OGBench('drawer', 32)
+    again = world.demonstrate(2)
+    world.close()
+    np.testing.assert_array_equal(episode.frames, again.episode.frames)
+    mark, = json.loads((tmp_path / BOTTLENECKS_FILE).read_text())['marks']
+    assert mark['stamps'] == [[episode.stamps[t] / 1e9 for t in again.bottleneck]]

@@ -6,8 +6,10 @@ from dataclasses import replace
 import json
 
 from experiments.worlds import loop
+from experiments.worlds.pushes import GoalPushes, RandomPushes
 from made_episodes import move_squares, write_bag
 import numpy as np
+import pytest
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 
@@ -49,3 +51,18 @@ def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
     assert [row['seed'] - loop.FIRST_SCENE for row in rows] == [1, 1, 3, 3]
     page = (tmp_path / 'worlds_loop.md').read_text()
     assert '| push-v3 | random | 2 | 0% (0 to 66)' in page and '| direct | 2 | 100%' in page
+
+
+def test_pushes_are_recorded_as_a_planner_and_its_model_need_them():
+    pytest.importorskip('metaworld')
+    worlds = GoalPushes('plate-slide-v3', 32), RandomPushes('push-v3', 32)
+    pushed, about = (world.demonstrate(3).episode for world in worlds)
+    for world in worlds:
+        world.close()
+    assert (pushed.task, pushed.outcome) == ('plate-slide-v3', 'success')
+    for episode in (pushed, about):
+        assert episode.object_source == 'ground_truth' and episode.robot_masks.any()
+        moved = episode.grippers[1:, :3] - episode.grippers[:-1, :3]
+        assert np.median(np.abs(moved - episode.actions[:-1, :3])) < 0.01, 'as it was told'
+    way = np.linalg.norm(pushed.object_poses[:, 0] - pushed.object_poses[0, 0], axis=1)
+    assert way[:4].max() < 0.01 and way[-1] > 0.1

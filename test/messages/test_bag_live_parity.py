@@ -131,7 +131,7 @@ def traffic(picture, joints):
 
 
 def seen_live(node, other, crop, sent, compressed, robot_mask):
-    """Publish messages; return {stamp: (Seen of the planner, Question to the predictor)}."""
+    """Publish messages; return {stamp: (Observation of the planner, Request to the predictor)}."""
     params = PARAMS | {'image_transport': 'compressed' if compressed else 'raw',
                        'robot_mask': robot_mask}
     planner = PlannerInputs(node, params, lambda: crop, lambda name: None)
@@ -156,7 +156,7 @@ def seen_live(node, other, crop, sent, compressed, robot_mask):
         while due is not None:  # until the picture and a state after it have come
             seen, lacking = planner.look()
             if seen is not None and seen.stamp_ns == due:
-                found[due] = seen, reader.read(PredictSubgoal.Request(), predictor).question
+                found[due] = seen, reader.read(PredictSubgoal.Request(), predictor).request
                 due = None
             assert time.monotonic() < deadline, lacking
             time.sleep(0.01)
@@ -184,14 +184,14 @@ def test_what_is_seen_live_is_what_is_read_from_the_recording(
     assert episode.object_source == 'tracked'
     for t, stamp in enumerate(episode.stamps.tolist()):
         shown = view.update(episode.frames[t], episode.robot_masks[t])
-        seen, question = live[stamp]
+        seen, request = live[stamp]
         np.testing.assert_array_equal(seen.image, shown)
         np.testing.assert_array_equal(seen.gripper, episode.grippers[t])
         assert seen.names == episode.object_names
         np.testing.assert_array_equal(seen.pixels, episode.object_pixels[t])
-        np.testing.assert_array_equal(question.start, shown)
+        np.testing.assert_array_equal(request.start, shown)
         np.testing.assert_array_equal(
-            question.goal, view.fill(episode.goal_frame, episode.goal_mask))
+            request.goal, view.fill(episode.goal_frame, episode.goal_mask))
         order = slice(None, None, 1 - 2 * (t % 2))  # the request has the order of the picture
-        np.testing.assert_array_equal(question.start_pixels, episode.object_pixels[t][order])
-        np.testing.assert_array_equal(question.goal_pixels, episode.goal_pixels[order])
+        np.testing.assert_array_equal(request.start_pixels, episode.object_pixels[t][order])
+        np.testing.assert_array_equal(request.goal_pixels, episode.goal_pixels[order])

@@ -16,6 +16,7 @@ from PIL import Image, ImageSequence
 from processes import Client, crowd, until
 import pytest
 from rclpy.duration import Duration
+from sim_bridge.tasks.tasks import get_task, sample_scene
 from std_msgs.msg import Header
 from tap_msgs.msg import ObjectStates
 from tap_ros.apps.demo import command
@@ -31,9 +32,8 @@ from tap_ros.apps.demo.film import (
     SIDE,
     START_MS,
 )
-from tap_ros.apps.demo.lane import Lane
 from tap_ros.apps.demo.report import gains, results_table, shown, summary, write_report
-from tap_ros.apps.demo.watch import Watch
+from tap_ros.apps.demo.watch import right_order, Watch
 from tap_ros.base.errors import TapError
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.recording.cache import open_recordings
@@ -68,6 +68,16 @@ def test_what_a_subgoal_decides_is_read_from_where_it_shows_the_objects():
     assert replace(one, order=(1, 0)).decided(told) == '2 first'  # numbers are the right order
     last_moved = replace(told, expected_pixels=(np.array([START[0], GOALS[1]]) + 0.5) / 4 - 0.5)
     assert one.decided(last_moved) == '2 first'
+
+
+def test_the_order_that_works_is_read_from_where_objects_stand_and_shall_stand():
+    for task, seeds in (('order2', range(20)), ('order3', range(20)), ('push2', range(20))):
+        for seed in seeds:
+            drawn = sample_scene(get_task(task), seed)
+            starts, goals = (np.insert(poses[:, :2], 2, 0.03, axis=1)
+                             for poses in (drawn.start_poses, drawn.goal_poses))
+            assert right_order(starts, goals) == (drawn.order if 'order' in task else ())
+    assert right_order(starts[:1], starts[:1]) == right_order(starts * np.nan, goals) == ()
 
 
 def test_all_panels_show_the_same_part_of_the_camera_view():
@@ -190,18 +200,16 @@ def test_real_nodes_push_tracked_objects_of_two_tasks_with_one_start(tmp_path, c
 @pytest.mark.slow
 def test_a_scene_ends_the_same_on_a_busy_machine_and_after_a_node_has_ended(tmp_path):
     options = command.Options(scenes=1, tasks=('push2',), step_budget=3)
-    lane = Lane(options, tmp_path, 'direct', ('push2',))
-    lane.start()
+    nodes = command.NodeSet(options, tmp_path, 'direct', ('push2',))
     try:
-        lane.wait_until_ready()
-        alone = lane.run('push2', SEED)
+        alone = command.run_scene([nodes], 'push2', SEED)
         with crowd(6):
-            beside = lane.run('push2', SEED)
-        lane._processes._processes['sim_node'].kill()
-        ended = lane.run('push2', SEED)
-        after = lane.run('push2', SEED)
+            beside = command.run_scene([nodes], 'push2', SEED)
+        nodes.processes._processes['sim_node'].kill()
+        ended = command.run_scene([nodes], 'push2', SEED)
+        after = command.run_scene([nodes], 'push2', SEED)
     finally:
-        lane.close()
+        nodes.close()
     assert 'sim_node ended with exit code -9' in str(ended)
     for other in (beside, after):
         assert np.array_equal(other.runs['direct'].distances, alone.runs['direct'].distances)

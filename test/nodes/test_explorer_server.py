@@ -17,7 +17,8 @@ from tap_msgs.msg import ObjectStates
 from tap_ros.apps.explorer.browser_commands import CommandError, parse_command
 from tap_ros.apps.explorer.display import GoalByHand
 from tap_ros.apps.explorer.node import ExplorerNode
-from tap_ros.apps.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
+from tap_ros.apps.explorer.server import ExplorerServer, MAX_BROWSERS, MAX_COMMAND
+from tap_ros.apps.server import is_loopback
 from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.base.errors import ConfigError
 from tap_ros.ros.calls import CallError
@@ -51,7 +52,7 @@ def get(server, path='/', **headers):
 
 def browse(server, query='', **headers):
     return connect(f'ws://127.0.0.1:{server.port}/socket{query}', additional_headers=headers,
-                   open_timeout=60, close_timeout=2, compression=None)
+                   open_timeout=60, close_timeout=2, compression=None, max_size=2**25)
 
 
 def test_browsers_get_all_that_is_there_then_what_changes_and_errors_of_their_own():
@@ -106,6 +107,21 @@ def test_browsers_that_leave_vanish_say_too_much_or_are_too_many_leave_nothing_b
             browser.send('x' * (MAX_COMMAND + 1))
             browser.recv(60)
         assert until(lambda: server.browsers == 0 and threading.active_count() <= threads)
+
+
+def test_a_browser_that_answers_nothing_or_takes_nothing_is_let_go(monkeypatch):
+    monkeypatch.setattr('tap_ros.apps.explorer.server.PING_S', 1.0)
+    hello = '\r\n'.join((
+        'GET /socket HTTP/1.1', 'Host: 127.0.0.1', 'Upgrade: websocket', 'Connection: Upgrade',
+        'Sec-WebSocket-Version: 13', 'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==', '', ''))
+    with serving() as server, browse(server) as answering:
+        for content in (b'', b'x' * 2**24):
+            with socket.create_connection(('127.0.0.1', server.port)) as silent:
+                silent.sendall(hello.encode())
+                assert until(lambda: server.browsers == 2)
+                server.put('camera', content)
+                assert until(lambda: server.browsers == 1)
+            assert answering.recv(60) == b'camera\0' + content
 
 
 def test_foreign_pages_and_foreign_names_that_lead_here_are_refused():
@@ -226,9 +242,10 @@ def test_goals_placed_by_hand_leave_the_others_and_belong_to_their_picture():
     def message(stamp, **places):
         """Return objects that a tracker follows: (u, v, state) of each."""
         u, v, states = zip(*places.values())
-        return encode_objects(
-            places, np.column_stack([u, v]), np.full((len(u), 7), np.nan), to_stamp(stamp),
-            WORLD_FRAME, ObjectStates.SOURCE_TRACKED, states, [0.5] * len(u))
+        found = encode_objects(places, np.column_stack([u, v]), None, to_stamp(stamp),
+                               WORLD_FRAME, ObjectStates.SOURCE_TRACKED)
+        found.states, found.confidence = states, [0.5] * len(u)
+        return found
 
     placed = []
     with Client('hand') as node:

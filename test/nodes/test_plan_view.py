@@ -12,7 +12,7 @@ from tap_ros.nodes.planner import plan_view
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.weights import FORWARD_MODEL
 
-# Seen from above: 60 px a metre, and what is higher is seen farther up, by 40 px a metre.
+# Observation from above: 60 px a metre, and what is higher is seen farther up, by 40 px a metre.
 ABOVE = ForwardModelConfig(
     table=(60, 0, 32, 0, -60, 32, 0, 0, 1), arm=(60, 0, 0, 35, 0, -60, -40, 30, 0, 0, 0, 1))
 HAND = np.array([0.1, -0.2, 0.05, 0.5], np.float32)

@@ -11,8 +11,8 @@ import pytest
 from rclpy.parameter import Parameter
 import tap_ros
 from tap_ros.nodes.planner.node import VisualMpcNode
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import MOST_REFUSED
+from tap_ros.planning.visual_mpc import Scene
 
 pytestmark = pytest.mark.slow
 

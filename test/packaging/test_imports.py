@@ -104,6 +104,11 @@ def test_imports_come_only_from_above():
     assert not wrong
 
 
+def test_the_package_does_without_the_simulator():
+    assert not [name for name, path in MODULES.items() if name.startswith('tap_ros')
+                and any(target.startswith('sim_bridge') for target in imported(path))]
+
+
 def test_without_ros_all_but_the_nodes_can_be_imported():
     names = [name for name in MODULES if not may_import_ros(name) and name != 'tap_ros.__main__']
     run = subprocess.run([sys.executable, '-c', IMPORT_ALL, *names], cwd=ROOT, text=True,

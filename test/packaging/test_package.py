@@ -22,7 +22,6 @@ ROSDEP_KEYS = {
     'PIL': 'python3-pil',
     'cv2': 'python3-opencv',
     'jinja2': 'python3-jinja2',
-    'matplotlib': 'python3-matplotlib',
     'numpy': 'python3-numpy',
     'scipy': 'python3-scipy',
     'tqdm': 'python3-tqdm',
@@ -123,7 +122,7 @@ def test_what_is_imported_is_declared_and_what_is_required_is_imported():
     assert not undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
                           'requirements-extras.txt', 'requirements-worlds.txt')
     assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt',
-                          'requirements-dev.txt')
+                          'requirements-dev.txt', 'requirements-worlds.txt')
     used = {'tensorboard'}  # by way of torch.utils.tensorboard
     for name in imported_packages('tap_ros', 'sim_bridge', 'experiments', 'test'):
         used |= distributions_of(name)

@@ -22,7 +22,7 @@ from tap_ros.training.forward_loss import (
     OBJECT_WEIGHT,
     STILL_WEIGHT,
 )
-from tap_ros.training.inpainted import FilledStore
+from tap_ros.training.frames import FilledStore
 from tap_ros.weights.weights import save_weights
 import torch
 from toy_world import ARM, make_episode, SIZE, TABLE, to_pixels
@@ -105,7 +105,7 @@ class Store(list):
 
 def config_for(bag, out, **changes):
     config = ForwardTrainingConfig(
-        recordings=(str(bag),), out=str(out), steps=4, batch_size=2, pictures=2,
+        recordings=(str(bag),), out=str(out), steps=4, batch_size=2,
         test_fraction=0.1, device='cpu', threads=1, save_every=2,
         log_every=2)
     return replace(config, **changes)

@@ -12,9 +12,8 @@ from tap_ros.planning.hierarchy import (
     Target,
 )
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
 import torch
 from toy_world import Telekinesis
@@ -84,20 +83,18 @@ def small_planner():
         search=SearchConfig(16, 1, 4), proposals=4, batch_size=16, threads=1))
 
 
-def test_samples_are_judged_leg_by_leg_with_the_seed_and_the_limits_that_are_given():
-    mpc, slow, plans = small_planner(), Limits(0.01, 0.02), []
+def test_samples_are_judged_leg_by_leg():
+    mpc, plans = small_planner(), []
 
-    def plan(seen, goal, *rest):
-        plans.append((seen, goal, rest, VisualMPC.plan(mpc, seen, goal, *rest)))
+    def plan(seen, goal):
+        plans.append((seen, goal, mpc.plan(seen, goal, Memory(7), Limits(0.01, 0.02))))
         return plans[-1][-1]
 
-    mpc.plan = plan
     samples = [subgoal(PLACES + 2.0 * i, i) for i in range(2)]
-    chosen = choose_sample(mpc, scene(PLACES), PLACES + 4.0, samples, 7, slow)
-    assert [rest for _, _, rest, _ in plans] == 4 * [(Memory(7), slow)]
+    chosen = choose_sample(mpc, scene(PLACES), PLACES + 4.0, samples, plan)
     costs = [sum(found.cost for *_, found in plans[i:i + 2]) for i in (0, 2)]
     assert chosen == [samples[np.argmin(costs)]]
-    for sample, (_, to, _, first), (then, _, _, _) in zip(samples, plans[::2], plans[1::2]):
+    for sample, (_, to, first), (then, _, _) in zip(samples, plans[::2], plans[1::2]):
         assert torch.equal(to.distances, mpc.goal(maps=sample.object_maps).distances)
         assert then.image is sample.image and then.object_pixels is sample.expected_pixels
         hand = gripper_after(np.zeros(4, np.float32), first.actions)
@@ -110,8 +107,12 @@ def test_subgoals_are_divided_by_their_sample_and_one_sample_needs_no_plan():
     between = [start + [2.0, 0.0], start + [4.0, 0.0]]
     found = [subgoal(astray, 0, 2), subgoal(astray, 0, 1),
              subgoal(between[0], 1, 2), subgoal(between[1], 1, 1)]
-    plans = []
-    taken = choose_sample(small_planner(), scene(start), goal, found,
-                          before_plan=lambda: plans.append(0))
+    mpc, plans = small_planner(), []
+
+    def plan(*leg):
+        plans.append(leg)
+        return mpc.plan(*leg)
+
+    taken = choose_sample(mpc, scene(start), goal, found, plan)
     assert taken == found[2:] and len(plans) == 6  # two legs and the last, for two samples
-    assert choose_sample(None, scene(start), goal, found[:2]) == found[:2]
+    assert choose_sample(None, scene(start), goal, found[:2], None) == found[:2]

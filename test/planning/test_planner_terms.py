@@ -14,9 +14,8 @@ from tap_ros.planning.cost import (
     PlanCost,
 )
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
 import torch
 from toy_world import SIZE, to_pixels

@@ -8,20 +8,19 @@ import numpy as np
 import pytest
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.reach import (
-    Aim,
     Command,
     End,
     MOST_LATE,
     MOST_REFUSED,
+    Observation,
     Reach,
     ReachConfig,
-    Seen,
+    SelectTargets,
     Wait,
 )
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC
 from toy_world import SIZE, Telekinesis
 
 SECOND = 10**9
@@ -38,16 +37,16 @@ def mpc():
 def look(t, pixels=START, **changes):
     """Return what is seen t seconds after the start; the picture differs from second to second."""
     image = np.random.default_rng(t).integers(0, 256, (SIZE, SIZE, 3), np.uint8)
-    seen = Seen(image, np.array([0, 0, 0.1, 0], np.float32), ('a', 'b'), pixels,
-                (t + 1) * SECOND, received=float(t))
+    seen = Observation(image, np.array([0, 0, 0.1, 0], np.float32), ('a', 'b'), pixels,
+                       (t + 1) * SECOND, received=float(t))
     return replace(seen, **changes)
 
 
 def begun(mpc, config=None, seed=3):
     """Return a loop that knows where to go from what is seen at 0."""
     reach = Reach(mpc, config or ReachConfig(10, max_age=5.0, timeout=5.0), seed)
-    assert isinstance(reach.step(look(0)), Aim)
-    reach.head_for([GOAL])
+    assert isinstance(reach.step(look(0)), SelectTargets)
+    reach.set_targets([GOAL])
     return reach
 
 
@@ -104,8 +103,8 @@ def test_a_refused_command_does_not_count_and_the_newer_picture_is_answered(mpc)
 def test_old_and_missing_sights_are_waited_for_and_then_end_the_goal(mpc):
     reach = begun(mpc)
     for seen in (None, look(1, received=-9.0)):
-        assert isinstance(reach.step(seen, now=1.0, lacking='nothing on the table'), Wait)
-    end = reach.step(None, now=5.1, lacking='nothing on the table')
+        assert isinstance(reach.step(seen, now=1.0, missing='nothing on the table'), Wait)
+    end = reach.step(None, now=5.1, missing='nothing on the table')
     assert isinstance(end, End) and end.outcome == 'aborted'
     assert '5.1 s' in end.message and 'nothing on the table' in end.message
 
@@ -164,7 +163,7 @@ def test_pictures_of_an_old_scene_are_not_used(mpc):
     reach = Reach(mpc, ReachConfig(10))
     answer = reach.step(look(0, scene_ns=2 * SECOND))
     assert isinstance(answer, Wait) and 'old scene' in answer.reason
-    assert isinstance(reach.step(look(1, scene_ns=2 * SECOND)), Aim)
+    assert isinstance(reach.step(look(1, scene_ns=2 * SECOND)), SelectTargets)
 
 
 @pytest.mark.parametrize('changes, words', [
@@ -209,12 +208,12 @@ def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
     first, second = Target(START + 2), Target(START + 4)
     reach = Reach(mpc, ReachConfig(10, rounds=2), 3)
     reach.step(look(0))
-    reach.head_for([first, GOAL])
+    reach.set_targets([first, GOAL])
     act(reach, 0)
     aim = reach.step(look(1, first.pixels))
-    assert isinstance(aim, Aim) and aim.seen.pixels is first.pixels and reach.steps == 1
-    assert isinstance(reach.step(look(1, first.pixels)), Aim)  # until it is told
-    reach.head_for([second, GOAL])
+    assert isinstance(aim, SelectTargets) and aim.seen.pixels is first.pixels and reach.steps == 1
+    assert isinstance(reach.step(look(1, first.pixels)), SelectTargets)  # until it is told
+    reach.set_targets([second, GOAL])
     for t, pixels, stage in ((1, first.pixels, 1), (2, second.pixels, 2), (3, START, 2)):
         command = reach.step(look(t, pixels))
         assert isinstance(command, Command) and command.stage == stage  # no third round
@@ -233,7 +232,7 @@ def test_a_later_round_knows_where_the_gripper_met_something(mpc, monkeypatch):
     monkeypatch.setattr(mpc, 'plan', plan_down)
     reach = Reach(mpc, ReachConfig(10, rounds=9), 3)
     for t in range(3):  # a round each; each time it stands at 0.1 m
-        assert isinstance(reach.step(look(t)), Aim)
-        reach.head_for([Target(START), GOAL])
+        assert isinstance(reach.step(look(t)), SelectTargets)
+        reach.set_targets([Target(START), GOAL])
         act(reach, t)
     assert [len(blocked) for blocked in known] == [0, 0, 1]

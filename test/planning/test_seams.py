@@ -15,9 +15,9 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.planning.cost import PlanCost
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
-from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig, Seen
+from tap_ros.planning.reach import Command, End, Observation, Reach, ReachConfig, SelectTargets
+from tap_ros.planning.visual_mpc import Scene
 from toy_world import SCALE, SIZE, Telekinesis
 
 START, GOAL = np.array([[8.0, 20.0]], np.float32), np.array([[20.0, 12.0]], np.float32)
@@ -36,11 +36,11 @@ def reach(mpc, budget=60):
     """Push in a world of telekinesis; return the End and the steps."""
     loop, pixels, step = Reach(mpc, ReachConfig(budget, reached=2.0), seed=1), START, 0
     while True:
-        seen = Seen(np.zeros((SIZE, SIZE, 3), np.uint8), np.zeros(4, np.float32), ('a',), pixels,
-                    step)
+        seen = Observation(np.zeros((SIZE, SIZE, 3), np.uint8), np.zeros(4, np.float32), ('a',),
+                           pixels, step)
         answer = loop.step(seen)
-        if isinstance(answer, Aim):
-            loop.head_for([Target(GOAL)])
+        if isinstance(answer, SelectTargets):
+            loop.set_targets([Target(GOAL)])
             answer = loop.step(seen)
         if isinstance(answer, End):
             return answer, loop.steps

@@ -10,9 +10,8 @@ from tap_ros.base.errors import ImageError, PlanningError
 from tap_ros.planning.action_sequences import FULL
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.weights import FORWARD_MODEL
 import torch

@@ -11,7 +11,7 @@ from tap_ros.base.errors import ConfigError, ImageError, WeightsError
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.prediction.protocol import Question
+from tap_ros.prediction.protocol import Request
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
 from tap_ros.weights.weights import save_weights
 import torch
@@ -74,7 +74,7 @@ def test_going_forward_each_prediction_is_the_next_context():
 
 
 @pytest.mark.parametrize('num_context, latent_size', [(1, 0), (2, 8)])
-def test_questions_answered_together_are_answered_as_alone(num_context, latent_size):
+def test_requests_answered_together_are_answered_as_alone(num_context, latent_size):
     predictor = SubgoalPredictor(lively_network(num_context=num_context, latent_size=latent_size))
     rng = np.random.default_rng(2)
     asked = []
@@ -83,12 +83,12 @@ def test_questions_answered_together_are_answered_as_alone(num_context, latent_s
         start_pixels, goal_pixels = rng.uniform(4, 28, (2, K, 2))
         if num_context == 1:
             goal = goal_pixels = None
-        asked.append(Question(start, goal, start_pixels, goal_pixels, samples, depth, len(asked)))
-    for question, together in zip(asked, predictor.predict_together(asked), strict=True):
+        asked.append(Request(start, goal, start_pixels, goal_pixels, samples, depth, len(asked)))
+    for request, together in zip(asked, predictor.predict_together(asked), strict=True):
         alone = predictor.predict(
-            question.start, question.goal, question.start_pixels, question.goal_pixels,
-            question.num_samples, question.recursion_depth, question.seed)
-        if latent_size and question.num_samples > 1 and question.recursion_depth == 1:
+            request.start, request.goal, request.start_pixels, request.goal_pixels,
+            request.num_samples, request.recursion_depth, request.seed)
+        if latent_size and request.num_samples > 1 and request.recursion_depth == 1:
             assert differ(alone[0].image, alone[-1].image) > 5  # by z
         for one, other in zip(alone, together, strict=True):
             assert (one.sample, one.level) == (other.sample, other.level)

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cache holds what the recording holds, whoever builds it and whatever happened to it."""
 
+from collections import Counter
+import hashlib
 import os
 import shutil
 import subprocess
@@ -13,6 +15,8 @@ import pytest
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording import cache as cache_module
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.mcap_file import McapFile
+from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import EpisodeWriter
 
 
@@ -37,19 +41,48 @@ def test_the_key_is_the_content_of_the_file(bag, episodes, cache, monkeypatch):
     assert sorted(os.listdir(cache)) == before
 
 
+def test_a_file_is_opened_and_hashed_once_and_again_when_it_has_changed(
+        bag, episodes, monkeypatch):
+    monkeypatch.setattr(cache_module, '_SETTLED_NS', 0)  # files made just now count as old ones
+    done = Counter()
+
+    def counted(name, function):
+        def call(*args):
+            done[name] += 1
+            return function(*args)
+        return call
+    monkeypatch.setattr(McapFile, '__init__', counted('opened', McapFile.__init__))
+    monkeypatch.setattr(hashlib, 'file_digest', counted('hashed', hashlib.file_digest))
+    for _ in range(2):
+        assert_all_equal(open_recordings(bag), episodes)
+        assert done == {'opened': 2, 'hashed': 2}
+    open_recordings(bag, reading=Reading(crop='centre', size=16), network='the predictor')
+    assert done == {'opened': 4, 'hashed': 2}
+    path = bag / 'push2_1.mcap'
+    before, data = path.stat(), path.read_bytes()
+    with EpisodeWriter(path) as writer:
+        writer.write(make_episode(seed=99))
+    assert open_recordings(bag).num_frames != sum(map(len, episodes))
+    assert done == {'opened': 6, 'hashed': 3}
+    path.write_bytes(data)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert_all_equal(open_recordings(bag), episodes)
+    assert done == {'opened': 6, 'hashed': 4}  # what it holds is known
+
+
 def test_damaged_caches_are_built_again(bag, episodes, cache):
     for name, size in (('frame', None), ('frame', 200), ('mask', None), ('mask', 200),
                        ('columns.safetensors', None), ('columns.safetensors', 0),
                        ('columns.safetensors', 100), ('columns.safetensors', -1)):
         open_recordings(bag)
-        for folder in cache.iterdir():
+        for folder in cache.glob('*-*'):
             path = folder / name
             if size is None:
                 path.unlink()
             else:
                 os.truncate(path, size % path.stat().st_size)
         assert_all_equal(open_recordings(bag), episodes)
-    assert len(list(cache.iterdir())) == 2  # a folder a file, nothing broken is left
+    assert len(list(cache.glob('*-*'))) == 2  # a folder a file, nothing broken is left
 
 
 def test_many_processes_may_build_at_once(bag, cache):
@@ -59,7 +92,7 @@ def test_many_processes_may_build_at_once(bag, cache):
                              text=True) for _ in range(3)]
     frames = {run.communicate()[0].strip() for run in runs}
     assert frames == {str(open_recordings(bag).num_frames)}
-    assert len(list(cache.iterdir())) == 2
+    assert len(list(cache.glob('*-*'))) == 2
 
 
 def test_large_recordings_are_decoded_in_other_processes(tmp_path, bag, episodes, monkeypatch):

@@ -18,8 +18,7 @@ from tap_ros.recording import mcap_file
 from tap_ros.recording import writer as writer_module
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.file_writer import FileWriter
-from tap_ros.recording.writer import EpisodeWriter
+from tap_ros.recording.writer import EpisodeWriter, FileWriter
 import zstandard
 
 IMAGE = 'sensor_msgs/msg/Image'

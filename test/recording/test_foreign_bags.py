@@ -21,7 +21,7 @@ import pytest
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
-from tap_ros.recording.topic_choice import find_topics
+from tap_ros.recording.topic_choice import Bag
 
 
 def test_of_a_bag_with_pictures_alone_all_else_is_unknown(tmp_path):
@@ -37,7 +37,7 @@ def test_of_a_bag_with_pictures_alone_all_else_is_unknown(tmp_path):
 
 
 def topics_of(bag, image_topic=''):
-    return find_topics(sorted(bag.glob('*.mcap')), image_topic)
+    return Bag(sorted(bag.glob('*.mcap'))).choose(image_topic).topics
 
 
 def test_another_image_topic_is_found_where_it_is_the_only_one_else_named(tmp_path):

@@ -64,6 +64,7 @@ def test_corners_contain_the_shapes_and_little_more():
     ('child link="b"', 'child link="x"', 'joint turn holds a link that is not there'),
     ('child link="c"', 'child link="b"', 'no tree'),
     ('<collision>', '<visual>', 'is no URDF'),
+    ('radius="0.5"', 'radius="nan"', 'radius="nan"; expected numbers'),
     ('<parent link="a"/>', '', 'joint turn lacks its parent')])
 def test_what_cannot_be_used_is_refused_in_one_line(old, new, words):
     assert old in ARM

@@ -11,13 +11,12 @@ import time
 
 import numpy as np
 import pytest
-from sim_bridge.collect import collect, CollectConfig, make_episode
+from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode
 from tap_ros.base.engines import Engine
 from tap_ros.base.errors import ConfigError, StorageError, TapError
 from tap_ros.base.files import only_writer
-from tap_ros.evaluation.bottleneck import bottleneck_share
 from tap_ros.recording.cache import open_recordings
 
 SMALL = CollectConfig(episodes=3, episodes_per_file=1, seed=5, frames=12)
@@ -67,10 +66,18 @@ def test_the_expert_pushes_one_object_home_after_the_other(simulator):
     assert firsts == {0, 1}
 
 
+def bottleneck_share(episode):
+    """Return when, from 0 to 1, one of two objects is home and the other untouched; else NaN."""
+    pixels = episode.object_pixels
+    to_start, to_goal = (np.linalg.norm(pixels - pixels[end], axis=-1) for end in (0, -1))
+    scores = (to_start.sum(1, keepdims=True) - to_start + to_goal).min(1)
+    return np.flatnonzero(scores <= 2).mean() / (len(scores) - 1) if scores.min() <= 2 else np.nan
+
+
 def test_bottlenecks_come_early_or_late_as_asked(simulator):
     shares, outcomes = {}, []
     for timing in ('early', 'late'):
-        found = [make_episode(simulator, *run_episode(simulator, seed, timing=timing))
+        found = [simulator.demonstrate(seed, timing=timing).episode
                  for seed in range(3)]
         shares[timing] = np.nanmedian([bottleneck_share(episode) for episode in found])
         outcomes += [episode.outcome == 'success' for episode in found]
@@ -125,7 +132,7 @@ def test_a_folder_is_never_mixed_with_other_settings(whole, tmp_path):
 
 
 def test_pushes_at_random_miss(simulator):
-    episode = make_episode(simulator, *run_episode(simulator, 4, misses=1.0))
+    episode = simulator.demonstrate(4, misses=1.0).episode
     low = episode.grippers[:, 2] < 0.03
     moved = np.linalg.norm(np.diff(episode.object_pixels, axis=0), axis=-1).max(1)
     assert (low[:-1] & low[1:] & (moved < 0.05)).any(), 'low, and nothing moves'

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from sim_bridge.demonstrations import demonstrate, find_bottleneck
-from sim_bridge.gym_pushes import record_pushes
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from sim_bridge.world_protocol import make_world
@@ -136,25 +135,6 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
     assert not (tmp_path / 'bad').exists()
 
 
-def test_pushes_of_a_world_are_recorded_as_a_planner_and_its_model_need_them(
-        metaworld, tmp_path):
-    config = CollectConfig(world='metaworld', task='plate-slide-v3', episodes=1, seed=3,
-                           image_size=32, pushes='goal')
-    collect(tmp_path / 'goal', config, Engine(workers=1), progress=False)
-    pushed, = open_recordings(tmp_path / 'goal')
-    about = record_pushes(metaworld, 3, 'random')
-    assert (pushed.task, pushed.outcome) == ('plate-slide-v3', 'success')
-    for episode in (pushed, about):
-        assert episode.object_source == 'ground_truth' and episode.robot_masks.any()
-        moved = episode.grippers[1:, :3] - episode.grippers[:-1, :3]
-        assert np.median(np.abs(moved - episode.actions[:-1, :3])) < 0.01, 'as it was told'
-    way = np.linalg.norm(pushed.object_poses[:, 0] - pushed.object_poses[0, 0], axis=1)
-    assert way[:4].max() < 0.01 and way[-1] > 0.1
-    for bad in ({'world': 'mujoco_table', 'task': 'push2'}, {'world': 'ogbench', 'task': 'cube'}):
-        with pytest.raises(TapError, match='pushes: '):
-            collect(tmp_path / 'bad', replace(config, **bad), progress=False)
-
-
 class Slider:
     """A hand that goes to a thing at 1 m and pushes it by 0.5 m."""
 
@@ -200,14 +180,3 @@ def test_the_bottleneck_is_where_the_hand_is_at_what_it_is_about_to_move():
     still = np.zeros((9, 3))
     assert find_bottleneck(still, np.zeros((9, 1))) is None, 'nothing moves'
     assert find_bottleneck(still, np.arange(9.0)[:, None]) is None, 'it moves from the start on'
-
-
-def test_oracles_of_ogbench_demonstrate_too():
-    pytest.importorskip('ogbench')
-    world = make_world('ogbench', 'drawer', 32)
-    found, again = world.demonstrate(2), world.demonstrate(2)
-    world.close()
-    assert found.episode.outcome == 'success' and found.bottleneck == again.bottleneck is not None
-    np.testing.assert_array_equal(found.episode.frames, again.episode.frames)
-    with pytest.raises(SceneError, match='collect --world ogbench'):
-        world.reset(0)

@@ -12,7 +12,7 @@ from sim_bridge.world.scene import FINGER_TRAVEL
 from sim_bridge.world.table import GRIPPER_MARGIN
 from tap_ros.base.contract import CONTROL_PERIOD, ROBOT_MASK_FREE, WORKSPACE_HIGH
 from tap_ros.base.errors import SceneError
-from tap_ros.planning.mpc_inputs import GRIPPER_HIGH, GRIPPER_LOW
+from tap_ros.planning.visual_mpc import GRIPPER_HIGH, GRIPPER_LOW
 
 PLACES = np.array([[0.2, 0.1], [-0.15, -0.2]])
 

@@ -9,16 +9,10 @@ import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.pushes import best_push, find_order, Moment
+from sim_bridge.tasks.motions import carry_out, Moment
+from sim_bridge.tasks.order import best_push, find_order
 from sim_bridge.tasks.stack import is_tower
-from sim_bridge.tasks.tasks import (
-    carry_out,
-    run_episode,
-    sample_scene,
-    Task,
-    task_names,
-    TaskScene,
-)
+from sim_bridge.tasks.tasks import run_episode, sample_scene, Task, task_names, TaskScene
 from sim_bridge.world.scene import random_shape
 from tap_ros.base import plugins
 from tap_ros.base.contract import SUCCESS_DISTANCE

@@ -14,7 +14,7 @@ from made_episodes import make_episode, write_bag
 import numpy as np
 import pytest
 from tap_ros.apps.cli import main
-from tap_ros.apps.mark_command import Marking, Server
+from tap_ros.apps.mark_command import Marking, MarkServer
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import only_keeper
 from tap_ros.recording.cache import open_recordings
@@ -116,12 +116,12 @@ def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_p
 def page(bag, store, tmp_path):
     """Serve the page; return what asks it, and the file it writes."""
     path = tmp_path / 'marks.json'
-    server = Server(Marking(store, [str(bag)], path))
+    server = MarkServer(Marking(store, [str(bag)], path))
     thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
 
     def ask(place, data=None, **headers):
-        return urlopen(Request(f'http://127.0.0.1:{server.server_port}/{place}', data, headers))
+        return urlopen(Request(f'http://127.0.0.1:{server.port}/{place}', data, headers))
 
     yield ask, path
     server.shutdown()
@@ -171,7 +171,7 @@ def test_connections_to_the_page_are_few_and_end_in_time(page, monkeypatch):
     ask, _ = page
     place = ask('state').url.split('/')[2].split(':')
     for name, value in (('LONGEST_S', 1e9), ('MAX_CONNECTIONS', 4)):
-        monkeypatch.setattr(f'tap_ros.apps.mark_command.{name}', value)
+        monkeypatch.setattr(f'tap_ros.apps.server.{name}', value)
     idle = [socket.create_connection(place) for _ in range(4)]
     with socket.create_connection(place) as one:
         assert one.recv(1) == b''
@@ -181,7 +181,7 @@ def test_connections_to_the_page_are_few_and_end_in_time(page, monkeypatch):
         with suppress(OSError):
             assert ask('state').read()
             break
-    monkeypatch.setattr('tap_ros.apps.mark_command.LONGEST_S', 0.2)
+    monkeypatch.setattr('tap_ros.apps.server.LONGEST_S', 0.2)
     with socket.create_connection(place) as slow:
         slow.sendall(b'POST /mark HTTP/1.0\r\nContent-Le')
         assert slow.recv(1) == b''

@@ -4,14 +4,14 @@
 
 from dataclasses import replace
 
+from experiments.paper.methods import method_fields
 from made_episodes import cover, write_bag
 import numpy as np
 import pytest
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.batches import Augmentation, make_batch, Pictures, Sampling
-from tap_ros.training.inpainted import fill
-from tap_ros.training.methods import method_fields
+from tap_ros.training.frames import FilledStore
 from tap_ros.training.objective import (
     discriminators_loss,
     Draws,
@@ -40,7 +40,7 @@ def batches(bags, robot_mask, **sampling):
     for bag in bags:
         store = open_recordings([bag], progress=False)
         found.append(make_batch(store, CHOSEN, Sampling(margin=1, video_frames=4, **sampling),
-                                pictures=Pictures(filled=fill(store, robot_mask))))
+                                pictures=Pictures(filled=FilledStore(store, robot_mask))))
     return found[0], replace(found[1], context=found[0].context)
 
 
@@ -88,11 +88,11 @@ def test_what_the_robot_looks_like_changes_nothing(bags, values):
 
 def test_a_share_of_the_context_pictures_is_filled(bags):
     share, store = 0.5, open_recordings([bags[0]], progress=False)
-    filled = fill(store, 'all')
+    filled = FilledStore(store, 'all')
     chosen = np.arange(8).repeat(8)
     batch = make_batch(store, chosen, Sampling(fill_context=share), np.random.default_rng(0),
                        Pictures(filled=filled))
-    shown = np.array([(context.numpy() == filled.frames([i], np.array([[0]]))[0, 0].numpy()).all()
+    shown = np.array([(context.numpy() == filled.gather([i], np.array([[0]]))[0, 0].numpy()).all()
                       for i, context in zip(chosen, batch.context[:, 0])])
     assert abs(shown.mean() - share) < 0.2
     assert (batch.bare[:, :, -2:, -2:] == 0).all() and (batch.targets[:, :, -2:, -2:] == 0).all()

@@ -6,12 +6,12 @@ from dataclasses import asdict, replace
 import json
 from pathlib import Path
 
+from experiments.paper.methods import method_fields
 import pytest
 import tap_ros
 from tap_ros.apps.cli import read
 from tap_ros.base.errors import ConfigError
 from tap_ros.training.forward_config import RECIPES as FORWARD_RECIPES
-from tap_ros.training.methods import method_fields
 from tap_ros.training.objective import LATENT_SIZE
 from tap_ros.training.predictor_config import RECIPES, TrainingConfig
 from tap_ros.training.run_config import FREE

@@ -4,13 +4,13 @@
 
 from dataclasses import replace
 
+from experiments.paper.methods import method_fields
 import numpy as np
 import pytest
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.losses import bell_preference, l1_error
 from tap_ros.prediction.networks import Prediction
 from tap_ros.training.batches import Augmentation, Batch
-from tap_ros.training.methods import method_fields
 from tap_ros.training.objective import (
     discriminators_loss,
     Draws,

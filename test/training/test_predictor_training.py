@@ -6,6 +6,7 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
+from experiments.paper.methods import method_fields
 import numpy as np
 import pytest
 from tap_ros.apps.cli import main
@@ -13,7 +14,6 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.batches import Pictures, Sampling
-from tap_ros.training.methods import method_fields
 from tap_ros.training.predictor import (
     draw_batch,
     kl_share,

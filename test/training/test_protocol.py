@@ -50,10 +50,10 @@ class Copying(Predictor):
         assert argument == 'anything'
         return cls()
 
-    def predict_together(self, questions):
-        return [[Subgoal(question.goal, np.zeros((0, 32, 32), np.float32),
+    def predict_together(self, requests):
+        return [[Subgoal(request.goal, np.zeros((0, 32, 32), np.float32),
                          np.zeros((0, 2), np.float32), np.zeros(0, np.float32), 0, 1)]
-                for question in questions]
+                for request in requests]
 
 
 def test_predictors_go_by_name_also_those_of_other_packages(bag, tmp_path, monkeypatch, capsys):

@@ -17,8 +17,8 @@ from tap_ros.images.robot_mask import (
 )
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.training.frames import GOAL, MappedFrames, ResidentFrames
-from tap_ros.training.inpainted import fill, FilledStore, with_masks
+from tap_ros.training.frames import FilledStore, GOAL, ResidentFrames
+from tap_ros.training.split import with_masks
 
 
 @pytest.fixture(autouse=True)
@@ -76,8 +76,7 @@ def test_filled_recordings_are_read_like_recordings(tmp_path, robot_mask='arm'):
     np.testing.assert_array_equal(found[4].goal_frame, plain.goal_frame)
     assert found.seen[4].all()
     chosen, times = [3, 4, 0], np.array([[0, 1, GOAL], [GOAL, 2, 3], [1, 1, 4]])
-    assert MappedFrames(found)(chosen, times).equal(ResidentFrames(found, 'cpu')(chosen, times))
-    assert fill(store, 'none') is None
+    assert found.gather(chosen, times).equal(ResidentFrames(found, 'cpu')(chosen, times))
 
 
 def test_only_episodes_with_masks_are_trained_on(tmp_path):

@@ -123,8 +123,8 @@ def test_a_run_of_other_settings_or_of_another_process_is_not_continued(half):
 
 def test_patience_keeps_the_best_weights_and_ends_when_none_better_come(tmp_path, monkeypatch):
     scores = {1: 3.0, 2: 1.0, 3: 2.0, 4: 2.0, 5: 0.5}
-    monkeypatch.setattr('tap_ros.training.predictor._score', lambda run, *_: (
-        {'relative': scores.get(run.state.step, 1.0)}, {}))
+    monkeypatch.setattr('tap_ros.training.predictor._score', lambda run, _: {
+        'relative': scores.get(run.state.step, 1.0)})
     patient = replace(CONFIG, patience=2, steps=9, save_every=1)
     held = {}
     for name, stops in (('whole', (9,)), ('parts', (1, 2, 3, 9, 9))):

@@ -11,7 +11,7 @@ import pytest
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.forward_config import ForwardTrainingConfig
-from tap_ros.training.run import paths_of
+from tap_ros.training.run import bags_of
 from tap_ros.training.split import split_episodes
 
 
@@ -80,9 +80,9 @@ def test_recordings_that_are_named_are_held_out_wherever_they_are(tmp_path, monk
     monkeypatch.chdir(tmp_path)
 
     def split(recordings, *held_out):
-        paths = paths_of(ForwardTrainingConfig(
+        bags = bags_of(ForwardTrainingConfig(
             recordings=tuple(recordings), held_out=held_out))
-        store = open_recordings(paths, tmp_path / 'cache', progress=False)
+        store = open_recordings(bags, tmp_path / 'cache', progress=False)
         return [[store[i].seed for i in part]
                 for part in split_episodes(store, 0.3, held_out=held_out)]
 

@@ -30,7 +30,7 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.apps.node_processes import NodeProcesses
 from tap_ros.nodes.predictor.requests import MAX_TOGETHER as TOGETHER
 from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.prediction.protocol import Question
+from tap_ros.prediction.protocol import Request
 from tap_ros.ros.calls import call, CallError
 from tap_ros.ros.client import Client, request_fields
 from tap_ros.ros.topics import SERVICE_QOS, STREAM, to_stamp
@@ -43,38 +43,23 @@ MOST_PROCESSES = 4  # of clients
 
 @dataclass(frozen=True)
 class Latency:
-    """
-    What one client saw, in turns with the model alone; all in s.
+    """What one client saw, in turns with the model alone; all in s."""
 
-    :param alone: (rounds * calls,), the model alone.
-    :param together: (rounds * calls / TOGETHER,), it with TOGETHER questions in a batch.
-    :param service: (rounds * calls,), from the call to the answer.
-    :param inside: of these, in the model.
-    :param node: of these, in the node, after a request was decoded: median.
-    """
-
-    alone: np.ndarray
-    together: np.ndarray
-    service: np.ndarray
-    inside: np.ndarray
-    node: float
+    alone: np.ndarray  # (rounds * calls,), the model alone
+    together: np.ndarray  # (rounds * calls / TOGETHER,), it with TOGETHER requests in a batch
+    service: np.ndarray  # (rounds * calls,), from the call to the answer
+    inside: np.ndarray  # of these, in the model
+    node: float  # of these, in the node, after a request was decoded: median
 
 
 @dataclass(frozen=True)
 class Load:
-    """
-    What many clients got.
+    """What many clients got."""
 
-    :param latencies: (answers,) s, of the calls that were answered with a prediction.
-    :param per_second: of these answers.
-    :param counts: of other ends: 'busy' (told to ask again), 'refused', 'lost' (no answer).
-    :param cpu_s: CPU time of the clients, for one answer.
-    """
-
-    latencies: np.ndarray
-    per_second: float
-    counts: Counter
-    cpu_s: float
+    latencies: np.ndarray  # (answers,) s, of the calls that were answered with a prediction
+    per_second: float  # of these answers
+    counts: Counter  # of other ends: 'busy' (told to ask again), 'refused', 'lost' (no answer)
+    cpu_s: float  # CPU time of the clients, for one answer
 
 
 @dataclass(frozen=True)
@@ -97,12 +82,7 @@ class Options:
 
 
 def run(args):
-    """Print the times of single calls, and what many clients get."""
-    measure(args)
-
-
-def measure(args):
-    """Return the rows of this benchmark, which it prints."""
+    """Print the times of single calls, and what many clients get; return rows."""
     with tempfile.TemporaryDirectory() as folder, NodeProcesses(folder) as nodes:
         nodes.start('predictor_node')
         with streaming(args.rate) as stream:
@@ -136,16 +116,9 @@ def measure(args):
 
 
 def compare_latency(stream, rounds, calls):
-    """
-    Time the model alone and the service in turns.
-
-    :param stream: process that publishes; it stands still while the model is alone.
-    :param rounds: turns of each.
-    :param calls: calls in each turn.
-    :return: Latency.
-    """
+    """Time the model alone and the service in turns, so many calls in a turn."""
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
-    question = Question(*pictures(), *PIXELS)
+    request = Request(*pictures(), *PIXELS)
     alone, together, service, inside = [], [], [], []
     with Client() as client:
         ask, request = make_client(client, SERVICE_QOS.depth), make_request()
@@ -154,8 +127,8 @@ def compare_latency(stream, rounds, calls):
         call(ask, request, 120)
         for _ in range(rounds):
             os.kill(stream.pid, signal.SIGSTOP)
-            alone += timed(lambda: predictor.predict_together([question]), calls)
-            together += timed(lambda: predictor.predict_together([question] * TOGETHER),
+            alone += timed(lambda: predictor.predict_together([request]), calls)
+            together += timed(lambda: predictor.predict_together([request] * TOGETHER),
                               -(-calls // TOGETHER))
             os.kill(stream.pid, signal.SIGCONT)
             service += timed(lambda: inside.append(
@@ -178,14 +151,7 @@ def timed(work, count, warm_up=5):
 
 
 def measure_load(clients, seconds, depth=SERVICE_QOS.depth):
-    """
-    Let many clients ask at once.
-
-    :param clients: how many, each with a client of its own.
-    :param seconds: how long they ask.
-    :param depth: answers that wait in the queue of a client; the default of ROS is 10.
-    :return: a Load.
-    """
+    """Let many clients ask at once for so many seconds, each with a queue of depth answers."""
     count = min(clients, MOST_PROCESSES)
     context = multiprocessing.get_context('spawn')
     barrier, results = context.Barrier(count), context.Queue()
@@ -204,12 +170,8 @@ def measure_load(clients, seconds, depth=SERVICE_QOS.depth):
 
 def ask_many(clients, seconds, depth, barrier, results):
     """
-    Be some of the clients, in a process of their own.
+    Be some of the clients, in a process of their own, from the barrier on.
 
-    :param clients: how many.
-    :param seconds: how long to ask.
-    :param depth: answers that wait in the queue of a client.
-    :param barrier: passed when all processes are ready.
     :param results: queue for (latencies, counts of other ends, s that it took, s of CPU time).
     """
     latencies, others = [], []

@@ -142,7 +142,7 @@ class Scene:
         image = Image.fromarray(canvas)
         draw = ImageDraw.Draw(image)
         for k, (u, v) in enumerate(at(places)):
-            draw.circle((u, v - 18), 10, fill=OBJECT_COLOURS[k], outline=(255, 255, 255))
+            draw.ellipse((u - 10, v - 28, u + 10, v - 8), OBJECT_COLOURS[k], (255, 255, 255))
             draw.text((u, v - 18), self.numbers[k], (255, 255, 255), ImageFont.load_default(16),
                       anchor='mm', stroke_width=1, stroke_fill=INK)
         return np.array(image)

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is seen of the demo's scenes, and the clicks with which a user would begin."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+import re
 import time
 from typing import Any
 
@@ -12,18 +13,23 @@ import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
+from tap_ros.apps.demo.film import GOAL, Run
+from tap_ros.base.contract import SUCCESS_DISTANCE
 from tap_ros.base.errors import TapError
 from tap_ros.images.robot_mask import nearest_free
-from tap_ros.messages.images import decode_mask
+from tap_ros.messages.images import decode_image, decode_mask
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.client import Client, positions_of, View
+from tap_ros.ros.reaching import ReachResult
 from tap_ros.ros.topics import LATCHED
 from tap_ros.tracking.protocols import LOST
 
 # Nothing is lost while this process, which also draws films, is held up.
 STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+FOLLOWED_NO_MORE = 'select the objects again'  # what reach_goal says of a lost object
 CLICKS, SLIP = 5, 0.015  # tries to click; how far beside the first the others are, of a picture
 
 
@@ -49,7 +55,7 @@ class Watch:
         if tracked:
             streams['camera/robot_mask'] = Image
         self._kept: dict[str, dict[int, Any]] = {topic: {} for topic in {view, *streams, *latched}}
-        self._node, self._timeout_s = client.node, client.timeout_s
+        self._client = client
         self._film: Any = None  # the subscription to the view
         for topics, qos in ((streams, STREAM), (latched, LATCHED)):
             for topic, kind in topics.items():
@@ -58,10 +64,10 @@ class Watch:
     def film(self, on: bool) -> None:
         """Keep the view, or not: then the simulator does not draw it either."""
         if on and self._film is None:
-            self._film = self._node.create_subscription(
+            self._film = self._client.node.create_subscription(
                 Image, self.view, partial(self._keep, self.view), STREAM)
         elif not on and self._film is not None:
-            self._node.destroy_subscription(self._film)
+            self._client.node.destroy_subscription(self._film)
             self._film = None
 
     def clear(self) -> None:
@@ -90,9 +96,36 @@ class Watch:
 
     def until(self, done: Callable[[], bool], timeout_s: float = 0.0) -> None:
         """Wait until something has come."""
-        deadline = time.monotonic() + (timeout_s or self._timeout_s)
+        deadline = time.monotonic() + (timeout_s or self._client.timeout_s)
         while not done() and time.monotonic() < deadline:
             time.sleep(0.02)
+
+    def run(self, start: View, goal: View, feedback: Sequence[Any], result: ReachResult) -> Run:
+        """
+        Return what was seen of an attempt.
+
+        :param start: the first picture; goal: with true positions.
+        :param feedback: of every step; result: of the goal.
+        :raises TapError: where moments are missing.
+        """
+        filming, steps = self._film is not None, result.steps
+        seen = self.since(start.stamp_ns, steps + 1, self.truth, *[self.view] * filming)
+        if len(seen) <= steps:
+            raise TapError(f'{self.truth}, {self.view}: {len(seen)} of {steps + 1} moments came')
+        truth = [objects for objects, *_ in seen]
+        pictures = [decode_image(image, self.view) for _, image in seen] if filming else [
+            start.image, self._client.camera(to_nanoseconds(truth[-1].header.stamp) - 1).image]
+        numbers = [(one.stage, re.search(r'\d+', one.stage)) for one in feedback]
+        heading = [GOAL if stage == 'goal' else int(number[0]) - 1 if number else 0
+                   for stage, number in numbers]
+        subgoals = self.since(start.stamp_ns, max(heading, default=GOAL) + 1, 'subgoal')
+        positions = np.array([positions_of(objects) for objects in truth])
+        return Run(
+            np.linalg.norm(positions - goal.positions, axis=-1), pictures,
+            np.array([decode_objects(objects, self.truth)[1] for objects in truth]), heading,
+            [decode_subgoal(one, start.names, (one.image.height, one.image.width))
+             for one, in subgoals], result.message,
+            float(np.median([one.planning_ms for one in feedback] or [np.nan])))
 
     def _keep(self, topic: str, message: Any) -> None:
         self._kept[topic][to_nanoseconds(message.header.stamp)] = message
@@ -142,3 +175,19 @@ def click(client: Client, watch: Watch, seed: int, start: View,
     goal = replace(goal, names=names, pixels=np.array([goal_pixels[name] for name in names]),
                    positions=positions_of(wanted))
     return start, goal, goal_pixels if lost else {}
+
+
+def right_order(starts: np.ndarray, goals: np.ndarray) -> tuple[int, ...]:
+    """
+    Return the only order of the objects that works: each stands on the goal of the next.
+
+    :param starts: (K, 3) m, where objects stand; goals: (K, 3).
+    :return: numbers of the objects; () where they are no such chain.
+    """
+    on = np.linalg.norm(starts[:, None] - goals, axis=-1) < SUCCESS_DISTANCE
+    np.fill_diagonal(on, False)
+    free = np.flatnonzero(~on.any(0)).tolist()  # those whose goals are
+    order = free[:1]
+    while len(order) < len(on) and on[order[-1:]].any():
+        order.append(int(on[order[-1]].argmax()))
+    return tuple(order) if len(free) == 1 < len(order) == len(on) else ()

@@ -7,12 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 import json
 import threading
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
+from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from tap_msgs.action import ReachGoal
-from tap_ros.apps.explorer.display import simulated
+from tap_ros.apps.explorer.display import Display, GoalByHand, simulated
 from tap_ros.base.errors import TapError
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
@@ -22,9 +23,6 @@ from tap_ros.ros.heartbeat import Presence, publishers_present
 from tap_ros.ros.reaching import Reaching, STATUS
 from tap_ros.ros.services import reason
 from tap_ros.weights import PREDICTORS
-
-if TYPE_CHECKING:
-    from tap_ros.apps.explorer.node import ExplorerNode
 
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
@@ -87,11 +85,14 @@ class ExplorerCalls:
     """
     Carries out the commands of browsers, each in a thread of its own; one goal at a time.
 
-    :param node: that another thread spins; what happens is told it.
+    :param node: rclpy Node that another thread spins.
+    :param display: that shows what happens.
+    :param on_error: called with what went wrong for which nobody but us is to blame.
     """
 
-    def __init__(self, node: 'ExplorerNode') -> None:
-        self._node = node
+    def __init__(self, node: Node, display: Display, on_error: Callable[[str], object]) -> None:
+        self._node, self._display, self._on_error = node, display, on_error
+        self._by_hand = GoalByHand(node)
         self._client = Client(node=node, timeout_s=TIMEOUT_S)
         self._lock = threading.Lock()
         self._goal: Reaching | None = None
@@ -166,8 +167,10 @@ class ExplorerCalls:
             getattr(self, f'_{do}')(**fields)
         except Exception as error:
             if isinstance(error, TapError) or not self._ending:  # else it is being taken down
-                self._node.complain(escaped(reason(self._node, do, error), 1000),
-                                    not isinstance(error, TapError))
+                text = escaped(reason(self._node, do, error), 1000)
+                self._display.add_problem(text)
+                if not isinstance(error, TapError):
+                    self._on_error(text)
         finally:
             if do == 'reach':
                 with self._lock:
@@ -178,54 +181,54 @@ class ExplorerCalls:
 
     def _reset(self, task: str, seed: int) -> None:
         response = self._call('reset', task=task, seed=seed)
-        self._node.tell(f'reset: {escaped(response.message)}')
+        self._display.add_line(f'reset: {escaped(response.message)}')
         if task in PREDICTORS and self._client.is_ready('predict'):
             weights = self._client.weights()
             if weights not in PREDICTORS:
-                self._node.tell(
+                self._display.add_line(
                     f'the predictor keeps {escaped(weights)}, which may not know {task}')
             elif weights != task and not weights.startswith(f'{task}_'):
                 self._client.use_weights(task)
-                self._node.tell(f'the predictor has the weights of {task} now')
+                self._display.add_line(f'the predictor has the weights of {task} now')
 
     def _select(self, objects: list[dict[str, Any]]) -> None:
         response = self._call('select', names=[one['name'] for one in objects],
                               u=[float(one['u']) for one in objects],
                               v=[float(one['v']) for one in objects])
-        self._node.show_selection(response, followed=True)
-        self._node.tell(f'following {listing(one.name for one in response.objects)}')
+        self._display.select(response, followed=True)
+        self._display.add_line(f'following {listing(one.name for one in response.objects)}')
 
     def _propose(self) -> None:
         response = self._call('select', propose=True)
-        self._node.show_selection(response, followed=False)
-        self._node.tell(f'{len(response.objects)} objects proposed')
+        self._display.select(response, followed=False)
+        self._display.add_line(f'{len(response.objects)} objects proposed')
 
     def _move(self, name: str, u: float, v: float) -> None:
-        node = self._node
+        display = self._display
         moved = simulated(
-            name, (u, v), node.places('goal_objects'), node.places('true_goals'),
-            node.size('goal')['width']) if self.offered('set_goal') else {}
+            name, (u, v), display.places('goal_objects'), display.places('true_goals'),
+            display.size('goal')['width']) if self.offered('set_goal') else {}
         if moved:
             self._client.set_goal(moved)
         else:
-            node.goal.place(name, (u, v), {
-                kind: message for kind, (message, _) in node.newest.copy().items()})
-        node.tell(f'goal: {escaped(name)} to pixel {u:.1f}, {v:.1f}')
+            self._by_hand.place(name, (u, v), {
+                kind: message for kind, (message, _) in display.newest.copy().items()})
+        display.add_line(f'goal: {escaped(name)} to pixel {u:.1f}, {v:.1f}')
 
     def _photograph(self) -> None:
         if self.offered('reset'):
             raise CallError('photograph: the simulator takes its goal pictures itself')
-        self._node.goal.photograph(
-            self._node.newest.get('camera'), followed=self.offered('select'))
-        self._node.tell('goal: what the camera sees now')
+        self._by_hand.photograph(
+            self._display.newest.get('camera'), followed=self.offered('select'))
+        self._display.add_line('goal: what the camera sees now')
 
     def _cancel(self) -> None:
         self._call('cancel')
-        self._node.tell('cancel: the planner was asked to end its goal, whoever sent it')
+        self._display.add_line('cancel: the planner was asked to end its goal, whoever sent it')
 
     def _predict(self) -> None:
         response = self._call('predict')
-        self._node.tell(f'predicted in {response.model_time_ms:.0f} ms: '
+        self._display.add_line(f'predicted in {response.model_time_ms:.0f} ms: '
                         f'{escaped(response.message, 300)}')
 
     def _reach(self, mode: str) -> None:
@@ -240,10 +243,10 @@ class ExplorerCalls:
             self._goal, cancelled = goal, self._cancelled
         if cancelled:  # meanwhile
             goal.cancel()
-        self._node.tell(f'{words}: begun')
+        self._display.add_line(f'{words}: begun')
         result = goal.result()
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
-        self._node.tell(f'{words}: {end} ({result.steps} steps)')
+        self._display.add_line(f'{words}: {end} ({result.steps} steps)')
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
         self._stage = (f'step {feedback.step}, to the {escaped(feedback.stage, 60)}, plan in '

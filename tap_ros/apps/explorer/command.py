@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import time
 from typing import Annotated
 
-from sim_bridge.tasks.tasks import task_names
-from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
-from tap_ros.apps.demo.command import new_folder
 from tap_ros.apps.node_processes import NodeProcesses
+from tap_ros.base.contract import DEFAULT_LOOK, LOOKS
 from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import free_folder
 from tap_ros.base.options import Folder, one_of
+from tap_ros.base.plugins import names
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 
@@ -31,7 +31,7 @@ class Options:
     :param logs: folder for the nodes' logs; a number is added when it exists.
     """
 
-    task: Annotated[str, one_of(task_names())] = 'push2'
+    task: Annotated[str, one_of(names('tap_ros.tasks'))] = 'push2'
     seed: int = 1_000_000
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     objects: Annotated[str, one_of(('tracked', 'truth'))] = 'tracked'
@@ -50,7 +50,7 @@ def run(args: Options) -> None:
     """
     if not 0 <= args.port < 2**16 or args.seed < 0:
         raise ConfigError('port: expected 0 to 65535; seed: 0 or more')
-    folder = new_folder(args.logs)
+    folder = free_folder(args.logs)
     with NodeProcesses(folder) as processes:
         # In lock-step a scene waits for those who look at it, however slow the machine is.
         processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,

@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What browsers are shown, and goals made by hand of it where no simulator takes goal pictures."""
 
+from collections import deque
 from collections.abc import Mapping
 from functools import cache
+import json
 import math
+import threading
 import time
 from typing import Any
 
@@ -13,11 +16,13 @@ import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
+from tap_msgs.srv import SelectObjects
 from tap_ros.base.errors import TapError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.drawing import overlay, png_bytes
 from tap_ros.messages.images import decode_image
+from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.ros_messages import encode_objects
@@ -28,8 +33,78 @@ SILENT_S = 2.0  # after which the page says that a topic is silent
 LARGEST = 640  # px; larger pictures are made smaller for the page
 LOSSLESS = 256  # px; larger ones are sent as JPEG
 NEAR = 0.06  # of the picture's width: so near are two pixels of one object
+LOG_LINES = 50
+NOTHING_SELECTED = json.dumps(
+    {'kind': 'selection', 'count': 0, 'followed': True, 'objects': []})
 
 Place = tuple[float, float]  # u, v in pixels
+
+
+class Display:
+    """
+    What has come and happened, for browsers; from any thread.
+
+    :param node: whose log names messages that cannot be used.
+    :ivar lock: of all that changes; newest: {kind: newest message, when it was received}.
+    :ivar sizes: {kind: (width, height)} of pictures before they are made smaller.
+    :ivar selection: what select_objects answered last, as JSON for the page.
+    :ivar log: the newest of log_count lines.
+    :ivar problem: what could not be done last.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.lock = threading.RLock()
+        self.newest: dict[str, tuple[Any, float]] = {}
+        self.sizes: dict[str, tuple[int, int]] = {}
+        self.selection, self._selections = NOTHING_SELECTED, 0
+        self.log: deque[str] = deque(maxlen=LOG_LINES)
+        self.log_count = 0
+        self.problem: dict[str, Any] = {'count': 0, 'text': ''}
+
+    def add_line(self, text: str) -> None:
+        """Write a line that all browsers show."""
+        with self.lock:
+            self.log.append(text)
+            self.log_count += 1
+
+    def add_problem(self, text: str) -> None:
+        """Say to all browsers what could not be done."""
+        with self.lock:
+            self.add_line(text)
+            self.problem = {'count': self.problem['count'] + 1, 'text': text}
+
+    def select(self, response: SelectObjects.Response, followed: bool) -> None:
+        """
+        Show outlines of objects that are followed from now on, or that are proposed.
+
+        They are relative to the pixel of their object, with which the page moves them.
+        """
+        self._selections += 1
+        self.selection = json.dumps({
+            'kind': 'selection', 'count': self._selections, 'followed': followed,
+            'objects': [{'name': escaped(one.name, 100), 'u': one.u, 'v': one.v, 'outline': [
+                [round(point.x - one.u, 1), round(point.y - one.v, 1)]
+                for point in outline.points]}
+                for one, outline in zip(response.objects, response.outlines)]})
+
+    def places(self, kind: str) -> dict[str, Place]:
+        """Return the places of objects by name; empty where they cannot be used."""
+        message, _ = self.newest.get(kind, (ObjectStates(), 0.0))
+        try:
+            found, pixels = decode_objects(message, kind)
+            return {each: (u, v) for each, (u, v) in zip(found, pixels.tolist())}
+        except TapError as error:
+            self.warn(error)
+            return {}
+
+    def size(self, kind: str) -> dict[str, int]:
+        """Return width and height of the newest picture of a kind; 0 without one."""
+        return dict(zip(('width', 'height'), self.sizes.get(kind, (0, 0))))
+
+    def warn(self, error: TapError) -> None:
+        """Log what cannot be shown, now and then."""
+        self._node.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
 
 
 def picture_of(message: Any, kind: str) -> np.ndarray:
@@ -132,9 +207,10 @@ class GoalByHand:
         goals = {each: goal for each, goal in goals.items() if each in objects}
         goals[name] = *pixel, SEEN, 1.0
         u, v, states, confidence = zip(*goals.values())
-        self._publish(encode_objects(
-            goals, np.column_stack([u, v]), None, of.header.stamp, of.header.frame_id,
-            ObjectStates.SOURCE_TRACKED, states, confidence), 'goal/objects')
+        message = encode_objects(goals, np.column_stack([u, v]), None, of.header.stamp,
+                                 of.header.frame_id, ObjectStates.SOURCE_TRACKED)
+        message.states, message.confidence = states, confidence
+        self._publish(message, 'goal/objects')
 
     def _publish(self, message: Any, topic: str) -> None:
         kind = type(message)

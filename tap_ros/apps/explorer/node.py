@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A page for browsers: see camera, goal, subgoal and plan, and try them."""
 
-from collections import deque
 from collections.abc import Mapping
 import json
-import threading
 import time
 from typing import Any
 
@@ -13,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates, Subgoal
-from tap_msgs.srv import SelectObjects
 from tap_ros.apps.explorer import display
 from tap_ros.apps.explorer.browser_commands import ExplorerCalls
 from tap_ros.apps.explorer.server import ExplorerServer
@@ -21,7 +18,6 @@ from tap_ros.base.errors import TapError
 from tap_ros.base.plugins import names
 from tap_ros.base.text import escaped
 from tap_ros.messages.images import is_empty
-from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
@@ -30,12 +26,9 @@ from tap_ros.ros.subscriptions import adapt_regularly, AdaptiveSubscription, ste
 from tap_ros.ros.topics import camera_image, LATCHED, STREAM
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
-LOG_LINES = 50
 STALE = 3  # of diagnostic_msgs/DiagnosticStatus
 OBSERVER = 'observer/image_raw'
 PICTURES = ('camera', 'goal', 'subgoal', 'plan', 'observer')
-NOTHING_SELECTED = json.dumps(
-    {'kind': 'selection', 'count': 0, 'followed': True, 'objects': []})
 
 
 class ExplorerNode(Node):
@@ -44,33 +37,22 @@ class ExplorerNode(Node):
 
     Pictures are encoded only while a browser is connected, the newest of each kind. A goal that
     was begun goes on when browsers leave; it is cancelled when this node ends.
-
-    :ivar newest: {kind: newest message, when it was received}.
-    :ivar goal: GoalByHand.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__('explorer_node', **options)
         self.params = declare_parameters(self)
-        self._lock = threading.Lock()
-        self.newest: dict[str, tuple[Any, float]] = {}  # kind -> message, when it came
+        self._display = display.Display(self)
         self._changed: set[str] = set()  # kinds whose newest message was not shown yet
-        self._sizes: dict[str, tuple[int, int]] = {}  # (width, height) before it is made smaller
         self._states: dict[str, tuple[int, str, float]] = {}  # level, text, when it came
-        self._log: deque[str] = deque(maxlen=LOG_LINES)
-        self._log_count = 0
         self._task = self.params['task']
-        self._problem: dict[str, Any] = {'count': 0, 'text': ''}
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
-        self._selections = 0  # answers of select_objects
-        self.goal = display.GoalByHand(self)
-        self._calls = ExplorerCalls(self)
-        self._server = ExplorerServer(
-            self._calls.do, self.params['host'], self.params['port'], self.params['token'])
-        self._server.put('selection', NOTHING_SELECTED)
         kind, topic = camera_image(self.params)
         self._diagnostics = Diagnostics(
             self, [topic, 'objects'], ['goal/image', 'goal/objects'])
+        self._calls = ExplorerCalls(self, self._display, self._diagnostics.error)
+        self._server = ExplorerServer(
+            self._calls.do, self.params['host'], self.params['port'], self.params['token'])
         adapt_regularly(self, [
             self._keep(Image, OBSERVER, 'observer', STREAM, counted=False),
             self._keep(Image, 'plan/overlay', 'plan', STREAM, counted=False),
@@ -104,96 +86,63 @@ class ExplorerNode(Node):
         def keep(message: Any, info: Mapping[str, Any]) -> None:
             if counted:
                 self._diagnostics.received(topic)
-            with self._lock:
-                before, _ = self.newest.get(name, (None, 0.0))
+            with self._display.lock:
+                newest = self._display.newest
+                before, _ = newest.get(name, (None, 0.0))
                 if name == 'goal' and is_empty(message):  # it was taken back
-                    self.newest.pop('goal', None)
-                    self._server.put('goal', b'')
+                    self._forget('goal')
                     return
                 if name == 'goal' and before not in (None, message):
-                    self._forget_plans()
-                if name in ('subgoal', 'plan') and self._is_old(message):
-                    return
-                self.newest[name] = message, reception_time(info)
+                    self._forget('subgoal', 'plan')  # they are for another goal
+                if name in ('subgoal', 'plan') and (
+                        0 < to_nanoseconds(message.header.stamp) < self._scene_ns):
+                    return  # of an old scene; stamp 0: of a file
+                newest[name] = message, reception_time(info)
                 self._changed.add(name)
         return AdaptiveSubscription(self, kind, topic, keep, qos)
 
-    def _forget_plans(self) -> None:
-        """Show no more what was predicted and planned for another goal."""
-        for kind in ('subgoal', 'plan'):
-            self.newest.pop(kind, None)
+    def _forget(self, *kinds: str) -> None:
+        """Show some pictures no more."""
+        for kind in kinds:
+            self._display.newest.pop(kind, None)
             self._changed.discard(kind)
             self._server.put(kind, b'')
-
-    def _is_old(self, message: Any) -> bool:
-        """Tell whether what was made of a picture belongs to an old scene; stamp 0: of a file."""
-        return 0 < to_nanoseconds(message.header.stamp) < self._scene_ns
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:
             self._task = escaped(message.task, 40)
-            self._server.put('selection', NOTHING_SELECTED)
-            with self._lock:
+            with self._display.lock:
+                self._display.selection = display.NOTHING_SELECTED
                 if self._calls.offered('reset'):  # stamps are the simulator's
                     self._scene_ns = to_nanoseconds(message.header.stamp)
-                self._forget_plans()
+                self._forget('subgoal', 'plan')
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self._states[escaped(status.name, 100)] = (
                 status.level[0], escaped(status.message, 200), time.monotonic())
 
-    def show_selection(self, response: SelectObjects.Response, followed: bool) -> None:
-        """
-        Show outlines of objects that are followed from now on, or that are proposed.
-
-        They are relative to the pixel of their object, with which the page moves them.
-        """
-        self._selections += 1
-        self._server.put('selection', json.dumps({
-            'kind': 'selection', 'count': self._selections, 'followed': followed,
-            'objects': [{'name': escaped(one.name, 100), 'u': one.u, 'v': one.v, 'outline': [
-                [round(point.x - one.u, 1), round(point.y - one.v, 1)]
-                for point in outline.points]}
-                for one, outline in zip(response.objects, response.outlines)]}))
-
     # What is shown
-
-    def tell(self, text: str) -> None:
-        """Write a line that all browsers show."""
-        with self._lock:
-            self._log.append(text)
-            self._log_count += 1
-
-    def complain(self, text: str, ours: bool) -> None:
-        """Say to all browsers what could not be done, and to /diagnostics what we did wrong."""
-        self.tell(text)
-        if ours:
-            self._diagnostics.error(text)
-        with self._lock:
-            self._problem = {'count': self._problem['count'] + 1, 'text': text}
 
     def _show(self) -> None:
         """Bring what browsers see up to date."""
         # Before the log: how a run ended is told first, so that who sees no run sees how it ended.
-        running, watched = self._calls.running, self._server.browsers
+        running, shown = self._calls.running, self._display
         stage = self._calls.stage if running else ''
-        with self._lock:
-            newest = dict(self.newest)
-            changed = self._changed if watched else self._changed - {*PICTURES}
-            self._changed = self._changed - changed
-            log, log_count, problem = list(self._log), self._log_count, self._problem
-        if not watched:
+        self._server.put('selection', shown.selection)
+        if not self._server.browsers:
             return
-        objects, goals = self.places('objects'), self.places('goal_objects')
-        for kind in PICTURES:
-            if kind in changed:
-                try:
-                    image = display.picture_of(newest[kind][0], kind)
-                    self._sizes[kind] = image.shape[1], image.shape[0]
-                    self._server.put(kind, display.picture_bytes(image, kind == 'plan'))
-                except TapError as error:
-                    self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
+        with shown.lock:
+            newest, changed, self._changed = dict(shown.newest), self._changed, set()
+            log, log_count, problem = list(shown.log), shown.log_count, shown.problem
+        for kind in changed & {*PICTURES}:
+            try:
+                image = display.picture_of(newest[kind][0], kind)
+                shown.sizes[kind] = image.shape[1], image.shape[0]
+                self._server.put(kind, display.picture_bytes(image, kind == 'plan'))
+            except TapError as error:
+                shown.warn(error)
+        objects, goals = shown.places('objects'), shown.places('goal_objects')
         now, simulator = time.monotonic(), self._calls.offered('reset')
         self._server.put('state', json.dumps({
             'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
@@ -201,18 +150,16 @@ class ExplorerNode(Node):
             'plans': not simulator or not display.grips(self._task),
             'tracker': self._calls.offered('select'),
             'observer': self.count_publishers(OBSERVER) > 0,
-            'movable': self._movable(bool(objects), bool(goals), 'goal' in newest),
-            'camera': {**self.size('camera'),
+            'movable': '' if running else self._movable(
+                bool(objects), bool(goals), 'goal' in newest),
+            'camera': {**shown.size('camera'),
                        'objects': display.listed(objects, newest.get('objects', [None])[0]),
                        'targets': display.listed({n: goals[n] for n in objects if n in goals}),
                        'note': display.silence(now, newest.get('camera'))},
-            'goal': {**self.size('goal'),
+            'goal': {**shown.size('goal'),
                      'objects': display.listed(goals, newest.get('goal_objects', [None])[0]),
-                     'pictured': 'goal' in newest,
-                     'note': '' if 'goal' in newest else 'none yet'},
-            'problem': problem,
-            'run': {'running': running, 'stage': stage,
-                    'text': stage or 'starting' if running else 'idle'},
+                     'pictured': 'goal' in newest},
+            'problem': problem, 'run': {'running': running, 'stage': stage},
             'diagnostics': [
                 {'name': name, 'level': level, 'message': text}
                 if now - came <= display.SILENT_S + 1 else
@@ -220,30 +167,13 @@ class ExplorerNode(Node):
                 for name, (level, text, came) in sorted(self._states.items())],
             'log': log, 'log_count': log_count}))
 
-    def places(self, name: str) -> dict[str, display.Place]:
-        """Return the places of objects by name; empty where they cannot be used."""
-        message, _ = self.newest.get(name, (ObjectStates(), 0.0))
-        try:
-            found, pixels = decode_objects(message, name)
-            return {each: (u, v) for each, (u, v) in zip(found, pixels.tolist())}
-        except TapError as error:
-            self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
-            return {}
-
     def _movable(self, objects: bool, goals: bool, pictured: bool) -> str:
         """Return in which picture objects can be dragged to their goals; '' in none."""
-        if self._calls.running:
-            return ''
         if self._calls.offered('set_goal') and goals:
             return 'goal'
         if not objects or (self._calls.offered('reset') and not self._calls.offered('select')):
             return ''
         return 'goal' if pictured else 'camera'
-
-    def size(self, kind: str) -> dict[str, int]:
-        """Return width and height of the newest picture of a kind; 0 without one."""
-        width, height = self._sizes.get(kind, (0, 0))
-        return {'width': width, 'height': height}
 
 
 def declare_parameters(node: Node) -> Parameters:

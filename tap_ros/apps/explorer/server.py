@@ -1,218 +1,197 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Serves the explorer's page and its WebSocket from one port, in a thread of its own.
+"""The WebSockets of the explorer's page: what is new goes out, commands come in."""
 
-Another page that is open in the same browser can connect to servers on this machine, too. So a
-browser is answered only where the page that connects is our own, and anybody who comes from
-another machine needs a token.
-"""
-
-import asyncio
-from collections.abc import Callable
-import contextlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
 from http import HTTPStatus
 from importlib.resources import files
-import ipaddress
 import json
-import logging
-import secrets
+import socket
 import threading
-from typing import TYPE_CHECKING
-from urllib.parse import parse_qs, quote, urlsplit
+import time
+from typing import Any
 
-from tap_ros.base.errors import ConfigError, TapError
-from tap_ros.base.text import escaped
-from websockets.asyncio.server import serve
+from tap_ros.apps.server import Handler, PageServer, refused
+from tap_ros.base.errors import TapError
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Response
+from websockets.exceptions import InvalidState
+from websockets.frames import CloseCode, DATA_OPCODES, Frame
+from websockets.http11 import Request
+from websockets.protocol import State
+from websockets.server import ServerProtocol
 
-if TYPE_CHECKING:
-    from websockets.asyncio.server import ServerConnection
-    from websockets.http11 import Request
-
-SOCKET = '/socket'
 MAX_COMMAND = 4096  # bytes
 MAX_BROWSERS = 64
-_PAGE = {'/': ('index.html', 'text/html'), '/explorer.css': ('explorer.css', 'text/css'), **{
-    f'/{name}.js': (f'{name}.js', 'text/javascript')
-    for name in ('explorer', 'pictures', 'hands')}}
-_POLICY = ("default-src 'none'; script-src 'self'; style-src 'self'; img-src blob: data:; "
-           "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
-_START_S, _END_S = 10.0, 5.0
+PING_S = 20.0  # a browser that is silent is asked, and has as long to answer
+_GOODBYE_S, _POLL_S = 1.0, 0.1
 
 
-class ExplorerServer:
+class ExplorerServer(PageServer):
     """
     Shows browsers the newest of each kind of content, and takes their commands.
 
-    Nothing is queued: who is slow misses what was replaced meanwhile, and gets the newest.
+    Nothing is queued: who is slow misses what was replaced meanwhile, and gets the newest. It
+    answers from the start, in threads of its own.
 
-    :param on_command: called with the text of each command, in the server's thread: it must not
-        block. A TapError that it raises is told to the browser that asked.
-    :param host: address to listen at.
-    :param port: to listen at; 0: any that is free.
-    :param token: that browsers must know; '' where host is of this machine alone: none is needed,
-        else one is made up.
-    :ivar browsers: how many are connected.
-    :raises ConfigError: when the address cannot be used; the message says why.
+    :param on_command: called with the text of each command, in the browser's thread. A TapError
+        that it raises is told to the browser that asked.
+    :param host: and the others: see PageServer.
     """
 
-    def __init__(self, on_command: Callable[[str | bytes], object], host: str = '127.0.0.1',
+    def __init__(self, on_command: Callable[[bytes], object], host: str = '127.0.0.1',
                  port: int = 8000, token: str = '') -> None:
-        if not host:
-            raise ConfigError('parameter host: is empty; name an address, such as 127.0.0.1')
-        self._on_command, self._host = on_command, host
-        self._token = token or ('' if is_loopback(host) else secrets.token_urlsafe(16))
+        super().__init__(files('tap_ros.apps.explorer').joinpath('page'), host, port, token)
+        self._on_command = on_command
         self._contents: dict[str, tuple[int, str | bytes]] = {}  # kind -> (number, content)
         self._count = 0  # of changes
-        self._changed: set[asyncio.Event] = set()  # one for each browser
-        self._loop = asyncio.new_event_loop()
-        self._ended = asyncio.Event()
-        self._started = threading.Event()
-        self._error: Exception | None = None
-        self.port, self.browsers = port, 0
-        self._thread = threading.Thread(target=self._run, name='explorer', daemon=True)
-        self._thread.start()
-        if not self._started.wait(_START_S) or self._error:
-            raise ConfigError(f'parameters host, port: cannot listen at {escaped(host, 100)}:'
-                              f'{port}: {escaped(self._error or "no answer", 200)}; choose '
-                              'another port, or 0 for any that is free')
+        self._changed = threading.Condition()  # guards these and the browsers
+        self._browsers: set[Browser] = set()
+        threading.Thread(target=self.serve_forever, args=(_POLL_S,), name='explorer',
+                         daemon=True).start()
 
     @property
-    def url(self) -> str:
-        """Where the page is, with the token where one is needed."""
-        host = f'[{self._host}]' if ':' in self._host else self._host
-        return f'http://{host}:{self.port}/' + (
-            f'?token={quote(self._token, safe="")}' if self._token else '')
+    def browsers(self) -> int:
+        """How many are connected."""
+        return len(self._browsers)
 
     def put(self, kind: str, content: str | bytes) -> None:
         """Replace the content of a kind; an equal one changes nothing. From any thread."""
-        with contextlib.suppress(RuntimeError):  # the server has ended
-            self._loop.call_soon_threadsafe(self._put, kind, content)
+        with self._changed:
+            if self._contents.get(kind, (0, None))[1] != content:
+                self._count += 1
+                self._contents[kind] = self._count, content
+                self._changed.notify_all()
 
     def close(self) -> None:
         """Say goodbye to all browsers and free the port."""
-        if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._ended.set)
-            self._thread.join(_END_S)
+        for browser in list(self._browsers):
+            browser.close()
+        self.shutdown()
+        self.server_close()
+        with self._changed:
+            self._changed.wait_for(lambda: not self._browsers, _GOODBYE_S)
+        for browser in list(self._browsers):
+            browser.end()
 
-    # In the thread of the server
-
-    def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            self._loop.run_until_complete(self._serve())
-        except Exception as error:  # an address can be wrong in many ways
-            self._error = error
-        finally:
-            self._started.set()
-            self._loop.close()
-
-    async def _serve(self) -> None:
-        # Of what browsers do wrong, websockets would log whole tracebacks.
-        logger = logging.getLogger('tap_ros.apps.explorer')
-        logger.setLevel(logging.CRITICAL)
-        async with serve(self._converse, self._host, self.port, process_request=self._answer,
-                         max_size=MAX_COMMAND, max_queue=4, logger=logger,
-                         close_timeout=1.0, compression=None, server_header=None) as server:
-            self.port = next(iter(server.sockets)).getsockname()[1]
-            self._started.set()
-            await self._ended.wait()
-
-    def _put(self, kind: str, content: str | bytes) -> None:
-        if self._contents.get(kind, (0, None))[1] != content:
-            self._count += 1
-            self._contents[kind] = self._count, content
-            for changed in self._changed:
-                changed.set()
-
-    def _answer(self, _: 'ServerConnection', request: 'Request') -> Response | None:
-        """Answer a request that is not to become a WebSocket; None lets it become one."""
-        try:
-            url = urlsplit(request.path)
-            own, known = self._is_own(request), self._knows_token(url.query)
-        except ValueError:  # an address or a header that is none
-            return _page(HTTPStatus.BAD_REQUEST, 'This address cannot be read.')
-        if not own:
-            return _page(HTTPStatus.FORBIDDEN, 'This page may not be used from there.')
-        # The page asks for its own files without the token, in which there is nothing to hide.
-        if url.path in ('/', SOCKET) and not known:
-            return _page(HTTPStatus.UNAUTHORIZED, 'A token is needed: open the address that '
-                                                  'explorer_node printed when it started.')
-        if url.path == SOCKET:
-            if self.browsers >= MAX_BROWSERS:
-                return _page(HTTPStatus.SERVICE_UNAVAILABLE, 'Too many browsers are connected.')
-            return None
-        if url.path not in _PAGE:
-            return _page(HTTPStatus.NOT_FOUND, 'There is nothing here.')
-        name, kind = _PAGE[url.path]
-        body = files('tap_ros.apps.explorer').joinpath('page', name).read_bytes()
-        return _page(HTTPStatus.OK, body, kind)
-
-    def _is_own(self, request: 'Request') -> bool:
-        """Return whether our own page asks, under a name of this server."""
-        host = ','.join(request.headers.get_all('Host'))
-        origins = request.headers.get_all('Origin')
-        if any(urlsplit(origin).netloc != host for origin in origins):
-            return False  # another page
-        # Else a name of another machine could be made to lead here.
-        return is_loopback(urlsplit(f'//{host}').hostname or '') or bool(self._token)
-
-    def _knows_token(self, query: str) -> bool:
-        token = ''.join(parse_qs(query).get('token', []))
-        return not self._token or secrets.compare_digest(token.encode(), self._token.encode())
-
-    async def _converse(self, browser: 'ServerConnection') -> None:
+    def converse(self, request: Handler) -> None:
         """Send what changes and take commands until the browser goes."""
-        self.browsers += 1
-        changed = asyncio.Event()
-        self._changed.add(changed)
-        sender = asyncio.create_task(self._send(browser, changed))
+        browser = Browser(request, lambda: self.ends.setdefault(
+            request.connection, time.monotonic() + _GOODBYE_S))
+        with self._changed:
+            if room := len(self._browsers) < MAX_BROWSERS:
+                self._browsers.add(browser)
         try:
-            async for text in browser:
-                try:
-                    self._on_command(text)
-                except TapError as error:
-                    await browser.send(json.dumps({'kind': 'error', 'text': str(error)}))
-        except ConnectionClosed:
-            pass
+            if not room:
+                request.send(refused(HTTPStatus.SERVICE_UNAVAILABLE,
+                                     'Too many browsers are connected.'))
+            elif browser.open():
+                self.ends.pop(request.connection)  # it may last
+                threading.Thread(target=self._send_news, args=(browser,), daemon=True).start()
+                for command in browser.messages():
+                    try:
+                        self._on_command(command)
+                    except TapError as error:
+                        browser.send(json.dumps({'kind': 'error', 'text': str(error)}))
         finally:
-            self._changed.remove(changed)
-            self.browsers -= 1
-            sender.cancel()
+            with self._changed:
+                self._browsers.discard(browser)
+                self._changed.notify_all()
 
-    async def _send(self, browser: 'ServerConnection', changed: asyncio.Event) -> None:
+    def _send_news(self, browser: 'Browser') -> None:
         """Send the newest of each kind, the oldest change first, to a browser that may be slow."""
         sent = 0
-        with contextlib.suppress(ConnectionClosed):
-            while True:
-                changed.clear()
+        while True:
+            with self._changed:
+                while self._count == sent and browser in self._browsers:
+                    self._changed.wait()
+                if browser not in self._browsers:
+                    return
                 new = sorted((number, kind, content) for kind, (number, content)
                              in self._contents.items() if number > sent)
                 sent = self._count
-                for _, kind, content in new:
-                    await browser.send(content if isinstance(content, str)
-                                       else kind.encode() + b'\0' + content)
-                await changed.wait()
+            for _, kind, content in new:
+                browser.send(content if isinstance(content, str)
+                             else kind.encode() + b'\0' + content)
 
 
-def is_loopback(host: str) -> bool:
-    """Return whether a name or address leads to this machine alone."""
-    if host == 'localhost':
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+class Browser:
+    """
+    A WebSocket; who does not answer, or takes nothing, for too long is let go.
 
+    :param request: that asks for it.
+    :param on_closing: called when it is about to end.
+    """
 
-def _page(status: HTTPStatus, body: str | bytes, kind: str = 'text/plain') -> Response:
-    """Return a whole answer."""
-    content = body.encode() if isinstance(body, str) else body
-    return Response(status.value, status.phrase, Headers({
-        'Content-Type': f'{kind}; charset=utf-8', 'Content-Length': str(len(content)),
-        'Content-Security-Policy': _POLICY, 'X-Content-Type-Options': 'nosniff',
-        'Referrer-Policy': 'no-referrer', 'Cache-Control': 'no-store',
-        'Connection': 'close'}), content)
+    def __init__(self, request: Handler, on_closing: Callable[[], object]) -> None:
+        self._socket, self._on_closing = request.connection, on_closing
+        self._socket.settimeout(PING_S)
+        self._lock = threading.RLock()  # of the protocol, and of what is sent
+        self._protocol = ServerProtocol(max_size=MAX_COMMAND)
+        self._request = Request(request.path, Headers(request.headers.items())).serialize()
+        request.close_connection = True  # no other request comes after this one
+
+    def open(self) -> bool:
+        """Shake hands; return whether that succeeded."""
+        for request in self._do(partial(self._protocol.receive_data, self._request)):
+            self._do(partial(self._protocol.send_response, self._protocol.accept(request)))
+        return self._protocol.state is State.OPEN
+
+    def messages(self) -> Iterator[bytes]:
+        """Yield what comes, until the end."""
+        message, silent = b'', False
+        while True:
+            try:
+                data = self._socket.recv(2 ** 16)
+            except TimeoutError:
+                if silent:
+                    return
+                silent = True
+                self._do(lambda: self._protocol.send_ping(b''))
+                continue
+            if not data:
+                return
+            silent = False
+            for frame in self._do(partial(self._protocol.receive_data, data)):
+                if isinstance(frame, Frame) and frame.opcode in DATA_OPCODES:
+                    message += frame.data
+                    if frame.fin:
+                        yield message
+                        message = b''
+
+    def send(self, content: str | bytes) -> None:
+        """Send a message; nothing once the browser goes."""
+        try:
+            self._do(partial(self._protocol.send_text, content.encode())
+                     if isinstance(content, str) else
+                     partial(self._protocol.send_binary, content))
+        except InvalidState:
+            pass
+        except OSError:
+            self.end()
+
+    def close(self) -> None:
+        """Say goodbye, unless something is on its way that takes long."""
+        if self._lock.acquire(timeout=_POLL_S):
+            with suppress(OSError, InvalidState):
+                self._do(partial(self._protocol.send_close, CloseCode.GOING_AWAY))
+            self._lock.release()
+
+    def end(self) -> None:
+        """End the connection."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def _do(self, step: Callable[[], object]) -> list[Any]:
+        """Take a step of the protocol, send what it wants sent, and return what has come."""
+        with self._lock:
+            step()
+            for data in self._protocol.data_to_send():
+                if data:
+                    self._socket.sendall(data)
+                else:
+                    self._socket.shutdown(socket.SHUT_WR)
+            if self._protocol.close_expected():
+                self._on_closing()
+            return self._protocol.events_received()

@@ -12,7 +12,7 @@ from tap_ros.base.errors import PlanningError
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
-from tap_ros.planning.reach import Seen
+from tap_ros.planning.reach import Observation
 from tap_ros.ros.client import Client
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.robot_view import RobotView
@@ -91,7 +91,7 @@ class GoalSource:
         return True
 
 
-def ask_subgoals(client: Client, inputs: PlannerInputs, request: ReachGoal.Goal, seen: Seen,
+def ask_subgoals(client: Client, inputs: PlannerInputs, request: ReachGoal.Goal, seen: Observation,
                  goal: np.ndarray, goal_pixels: np.ndarray, timeout_s: float,
                  give_up: Callable[[], bool]) -> list[Subgoal]:
     """

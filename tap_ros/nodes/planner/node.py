@@ -33,9 +33,8 @@ from tap_ros.nodes.planner.settings import declare_parameters
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.reach import Aim, Command, End, Reach, Seen
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.reach import Command, End, Observation, Reach, SelectTargets
+from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.client import Client
 from tap_ros.ros.diagnostics import Diagnostics
@@ -251,10 +250,10 @@ class VisualMpcNode(LifecycleBase):
             count = self._sensors.count
             while self._refusals:
                 reach.refused(*self._refusals.popleft())
-            seen, lacking = self._inputs.look()
+            seen, missing = self._inputs.look()
             if self._goal.changed(accepted):
                 reach = Reach(self._mpc, config, request.seed, accepted)
-            answer = reach.step(seen, time.monotonic(), lacking)
+            answer = reach.step(seen, time.monotonic(), missing)
             result.steps, result.expected_distance = reach.steps, reach.distance
             if isinstance(answer, End):
                 if answer.outcome == 'aborted':
@@ -262,8 +261,8 @@ class VisualMpcNode(LifecycleBase):
                 self._distance.publish(Float64(data=reach.distance))
                 result.success, result.message = answer.outcome == 'reached', answer.message
                 return
-            if isinstance(answer, Aim):
-                reach.head_for(self._aim(handle, mode, answer.seen, config.limits),
+            if isinstance(answer, SelectTargets):
+                reach.set_targets(self._aim(handle, mode, answer.seen, config.limits),
                                time.monotonic())
                 continue
             # Before sending: the picture that answers may come at once.
@@ -276,7 +275,7 @@ class VisualMpcNode(LifecycleBase):
             else:
                 self._sensors.wait_for_change(0.1, count)
 
-    def _aim(self, handle: ServerGoalHandle, mode: str, seen: Seen,
+    def _aim(self, handle: ServerGoalHandle, mode: str, seen: Observation,
              limits: Limits) -> list[Target]:
         """Return the Targets of a goal, asking for subgoals in that mode."""
         if not seen.names:
@@ -304,9 +303,14 @@ class VisualMpcNode(LifecycleBase):
             self._go_on(handle)
             raise
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
+
+        def plan(scene: Scene, goal: Goal) -> Plan:
+            self._go_on(handle)
+            return self._mpc.plan(scene, goal, Memory(request.seed), limits)
+
         return targets_by(choose_sample(
-            self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found,
-            request.seed, limits, lambda: self._go_on(handle)), goal_pixels)
+            self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found, plan),
+            goal_pixels)
 
     def _send(self, handle: ServerGoalHandle, accepted: float, reach: Reach,
               command: Command) -> bool:

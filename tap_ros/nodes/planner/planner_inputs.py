@@ -22,7 +22,7 @@ from tap_ros.messages.joints import GripperHistory
 from tap_ros.messages.objects import decode_cut_objects, decode_states
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
-from tap_ros.planning.reach import Seen
+from tap_ros.planning.reach import Observation
 from tap_ros.ros.observations import JUMP_NS, Observations, reception_time
 from tap_ros.ros.parameters import declared_arm, Parameters
 from tap_ros.ros.robot_view import RobotView
@@ -75,15 +75,15 @@ class PlannerInputs:
     def begin(self, since: float) -> None:
         """Begin a goal: only what is received from this monotonic time on is seen."""
         self._since = since
-        self._seen: Seen | None = None
+        self._seen: Observation | None = None
         self.frame_id = ''
         self._publishers = publishers_of(self._node, self._names)
 
-    def look(self) -> tuple[Seen | None, str]:
+    def look(self) -> tuple[Observation | None, str]:
         """
         Return what was seen last.
 
-        :return: Seen, or None when nothing was; which sensors are silent, '' if none is.
+        :return: Observation, or None when nothing was; which sensors are silent, '' if none is.
         :raises TapError: for messages that cannot be used.
         """
         rival = rivals(self._node, self._names, self._publishers)
@@ -95,9 +95,9 @@ class PlannerInputs:
             return None, f'{cameras}; leave one of them'
         topics = self.topics
         moment = self.sensors.newest(*topics, since=self._since)
-        lacking = self._lacking(topics)
+        missing = self._lacking(topics)
         if moment is None:
-            return None, lacking or self._unmatched_joints() or (
+            return None, missing or self._unmatched_joints() or (
                 f'no messages of the same stamp on {self.sensors.names(topics)} since the goal '
                 'was accepted')
         times: dict[str, Any] = {
@@ -110,7 +110,7 @@ class PlannerInputs:
         else:
             self._seen = self._decode(moment.messages, moment.stamp_ns, times)
             self.frame_id = moment.messages['image'].header.frame_id
-        return self._seen, lacking
+        return self._seen, missing
 
     @property
     def _lock_step(self) -> bool:
@@ -211,8 +211,9 @@ class PlannerInputs:
             with suppress(TapError):  # look() reports it
                 self._picture(moment.messages)
 
-    def _decode(self, messages: dict[str, Any], stamp_ns: int, times: dict[str, Any]) -> Seen:
-        """Return a Seen; the objects keep the order in which they were seen first."""
+    def _decode(self, messages: dict[str, Any], stamp_ns: int,
+                times: dict[str, Any]) -> Observation:
+        """Return an Observation; the objects keep the order in which they were seen first."""
         name, crop = self._types['image'][1], self._crop()
         picture = self._picture(messages)
         self._camera_size = picture.shape[:2]
@@ -227,7 +228,7 @@ class PlannerInputs:
             order = [names.index(name) for name in self._seen.names]
             names, pixels = self._seen.names, pixels[order]
             states = tuple(states[k] for k in order) if states else ()
-        return Seen(self.cut(picture, name), messages['joints'], names, pixels, stamp_ns,
+        return Observation(self.cut(picture, name), messages['joints'], names, pixels, stamp_ns,
                     states=states, **times)
 
     def _lacking(self, topics: Collection[str]) -> str:

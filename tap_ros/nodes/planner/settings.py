@@ -20,9 +20,8 @@ from tap_ros.base.plugins import names
 from tap_ros.base.text import escaped
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
-from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import ReachConfig
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.visual_mpc import Scene, VisualMPC
 from tap_ros.ros.parameters import check_device, Parameters
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 

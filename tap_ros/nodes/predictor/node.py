@@ -133,12 +133,12 @@ class PredictorNode(LifecycleBase):
         if not self._unshown:
             return
         task, subgoal, message = self._unshown.pop()
-        question = task.question
+        request = task.request
         try:
             self._subgoal.publish(message)
             self._picture.publish(message.image)
-            picture = overlay(question.start, subgoal.object_maps, OVERLAY_SCALE,
-                              question.start_pixels, question.goal_pixels)
+            picture = overlay(request.start, subgoal.object_maps, OVERLAY_SCALE,
+                              request.start_pixels, request.goal_pixels)
             self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
         except Exception as error:
             self._diagnostics.error(error)
@@ -186,7 +186,7 @@ class PredictorNode(LifecycleBase):
 def predict(predictor: Predictor, tasks: list[requests.PendingRequest]) -> list[Found]:
     """Predict a batch; return subgoals and ms for each PendingRequest."""
     begin = time.perf_counter()
-    found = predictor.predict_together([task.question for task in tasks])
+    found = predictor.predict_together([task.request for task in tasks])
     elapsed_ms = (time.perf_counter() - begin) * 1e3
     return [(subgoals, elapsed_ms) for subgoals in found]
 

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.base.contract import CAMERA_FRAME
+from tap_ros.base.contract import CAMERA_FRAME, MODES
 from tap_ros.base.errors import ConfigError, ImageError, TapError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import TrainedCrop
@@ -23,14 +23,13 @@ from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.objects import check_found, decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.prediction.protocol import Predictor, Question
+from tap_ros.prediction.protocol import Predictor, Request
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.parameters import Parameters
 from tap_ros.ros.robot_view import RobotView
 from tap_ros.ros.ros_messages import encode_subgoal
 from tap_ros.ros.subscriptions import rivals
 from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, STREAM
-from tap_ros.training.methods import MODES
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
@@ -60,7 +59,7 @@ class PendingRequest:
     """A request, checked and decoded."""
 
     mode: str
-    question: Question
+    request: Request
     names: tuple[str, ...]  # K object names; none where a picture lacks objects
     lacking: str  # why there are none; empty if there are
     stamp: Time  # of the start picture
@@ -69,7 +68,7 @@ class PendingRequest:
     @property
     def rows(self) -> int:
         """Return its share of a batch: about one for each map that is predicted."""
-        return self.question.num_samples * max(len(self.names), 1)
+        return self.request.num_samples * max(len(self.names), 1)
 
 
 class RequestReader:
@@ -124,11 +123,11 @@ class RequestReader:
         goal_pixels = match_objects(
             names, goal.names, goal.pixels, 'start_objects', 'goal_objects'
         ) if names and goal else None
-        question = Question(start.image, goal.image if goal else None,
+        request = Request(start.image, goal.image if goal else None,
                             start.pixels if names else None, goal_pixels,
                             num_samples, depth, request.seed)
         return PendingRequest(
-            predictor.mode, question, names, lacking, start.stamp, start.frame_id)
+            predictor.mode, request, names, lacking, start.stamp, start.frame_id)
 
     def _view(self, name: str, image: Image, objects: ObjectStates,
               crop: TrainedCrop) -> AskedPicture:
@@ -205,11 +204,11 @@ class RequestReader:
 def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],
                   elapsed_ms: float) -> PredictSubgoal.Response:
     """Return the response to a PendingRequest."""
-    wanted = task.question.num_samples
+    wanted = task.request.num_samples
     message = (f'{task.mode}, {len(subgoals)} subgoal{"s" * (len(subgoals) > 1)}, '
                + (f'no object maps: {task.lacking}' if task.lacking
                   else f'maps of {listing(task.names)}'))
-    if len(subgoals) < wanted * task.question.recursion_depth:
+    if len(subgoals) < wanted * task.request.recursion_depth:
         message += (f'; one sample instead of {wanted}, as these weights have no latent variable '
                     'and all samples would be the same')
     return PredictSubgoal.Response(

@@ -85,7 +85,7 @@ class RobotMaskNode(Node):
         named = self.params['urdf'] in names('tap_ros.arms')
         hand_link = self.params['hand_link'] or (TIP_FRAME if named else '')
         hand = robot.held_by(hand_link) if hand_link else set()
-        self._base = self.params['base_frame'] or robot.root
+        self._base = self.params['base_frame'] or robot.links[0]
         robot.held_by(self._base)
         self._labels = [ROBOT_MASK_HAND if shape.link in hand else ROBOT_MASK_ARM
                         for shape in robot.shapes]

@@ -458,10 +458,11 @@ class TrackerNode(Node):
             poses[:, :2] = plane.of_middle(plane.shrink(tracked.pixels))
             poses[:, 2] = MIDDLE
             poses[(np.array(tracked.states) == LOST) | ~np.isfinite(poses[:, :3]).all(1)] = np.nan
-        return encode_objects(
+        message = encode_objects(
             found, tracked.pixels, poses, header.stamp,
-            header.frame_id if plane is None else WORLD_FRAME, ObjectStates.SOURCE_TRACKED,
-            tracked.states, tracked.confidence)
+            header.frame_id if plane is None else WORLD_FRAME, ObjectStates.SOURCE_TRACKED)
+        message.states, message.confidence = tracked.states, list(map(float, tracked.confidence))
+        return message
 
 
 def declare_parameters(node: Node) -> Parameters:

@@ -27,15 +27,14 @@ from tap_ros.base.contract import MAX_PICTURE_BYTES
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.encodings import decompress
+from tap_ros.recording.bags import what_else, what_is
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.file_bytes import what_else
-from tap_ros.recording.foreign import what_is
 from tap_ros.recording.formats.pictures import (
     decoded,
     find_files,
-    Lacking,
     make_episode,
     Options,
+    Skipped,
     write_bag,
 )
 from tap_ros.recording.metadata import natural
@@ -55,26 +54,26 @@ def run(args: Options) -> None:
     import h5py
     while h5py.h5pl.size():  # a plug-in for an array is code
         h5py.h5pl.remove(0)
-    lacking = Lacking()
-    files = find_files(args.paths, ('*.hdf5', '*.h5'), lacking)
+    skipped = Skipped()
+    files = find_files(args.paths, ('*.hdf5', '*.h5'), skipped)
 
     def episodes() -> Iterator[Episode]:
         numbers = count()
         for file in files:
-            with lacking.passing_over('file', place := escaped(file.name)):
+            with skipped.errors_of('file', place := escaped(file.name)):
                 if why := (what_is if file.name.endswith('.zarr.zip') else what_else)(file):
                     raise RecordingError(why)
                 with h5py.File(file, 'r') as root:
-                    arrays = dict(_arrays(root, lacking, Budget(file.stat().st_size)))
+                    arrays = dict(_arrays(root, skipped, Budget(file.stat().st_size)))
                     for name, number in zip(_chosen(arrays, args.camera), numbers):
-                        with lacking.passing_over('array', f'{escaped(name)} of {place}'):
+                        with skipped.errors_of('array', f'{escaped(name)} of {place}'):
                             frames, rows = decoded(
                                 arrays[name](), lambda each: args.cut.image(_picture(each)),
-                                lacking, f'episode {number}')
+                                skipped, f'episode {number}')
                             yield make_episode(
                                 frames, rows / (args.fps or FPS), task=args.task, seed=number)
 
-    print(write_bag(args, episodes(), lacking=lacking))
+    print(write_bag(args, episodes(), skipped=skipped))
 
 
 def _chosen(arrays: Collection[str], camera: str) -> list[str]:
@@ -99,7 +98,7 @@ def _camera(name: str) -> str:
         r'\d$', group)), last])
 
 
-def _arrays(root: Any, lacking: Lacking,
+def _arrays(root: Any, skipped: Skipped,
             budget: Budget) -> Iterator[tuple[str, Callable[[], Iterable[Any]]]]:
     """Yield the arrays of pictures in a file: their paths, and what reads them."""
     import h5py
@@ -111,7 +110,7 @@ def _arrays(root: Any, lacking: Lacking,
         seen.add(address)
         for name in set(group) - {'next_obs'}:  # robomimic's observations once more
             path = above + os.fsdecode(name)
-            with lacking.passing_over('array', f'{escaped(path)} of {place}'):
+            with skipped.errors_of('array', f'{escaped(path)} of {place}'):
                 if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                     continue  # to another file, or what is read anyway
                 one = group[name]

@@ -26,15 +26,15 @@ from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
+from tap_ros.recording.bags import what_else
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
-from tap_ros.recording.file_bytes import what_else
 from tap_ros.recording.formats.pictures import (
     DAMAGE,
     decoded,
-    Lacking,
     make_episode,
     MOST_CHARACTERS,
+    Skipped,
     Target,
     video_frames,
     write_bag,
@@ -78,7 +78,7 @@ def run(args: Options) -> None:
     :raises TapError: for a set that cannot be read, and a folder that holds something.
     """
     data = DataSet(args.path, args.camera)
-    said = write_bag(args, data.episodes(args.cut), len(data.rows), data.lacking)
+    said = write_bag(args, data.episodes(args.cut), len(data.rows), data.skipped)
     print(f'{said} of {escaped(data.camera)}')
     if any(data.marks):
         path = beside(args.out)
@@ -98,7 +98,7 @@ class DataSet:
     :param camera: feature whose pictures are taken; '': the only one of colour.
     :ivar rows: of meta/episodes, dicts in the order of the episodes, in the form of version 3.
     :ivar unused: features that are not taken over.
-    :ivar lacking: what could not be used so far.
+    :ivar skipped: what could not be used so far.
     :ivar marks: of each episode so far the last frame of each subtask but the last one.
     :raises RecordingError: when it is none, or damaged.
     :raises ConfigError: for a camera that it has not, or has not alone.
@@ -128,7 +128,7 @@ class DataSet:
             raise RecordingError(f'{escaped(self.folder)}: version {escaped(version, 20)}, '
                                  f'{self.fps} frames a second; expected v2 or v3')
         self._file: tuple[Path, Any] | None = None  # data file in memory
-        self.lacking = Lacking()
+        self.skipped = Skipped()
         self.marks: list[list[int]] = []
         self.rows = self._read_rows(count)
         colour = [name for name in colour if not self._is_deep(name)]
@@ -152,7 +152,7 @@ class DataSet:
         :param crop: Crop of the pictures.
         """
         for row in self.rows:
-            with self.lacking.passing_over('episode', escaped(row['episode_index'], 20)):
+            with self.skipped.errors_of('episode', escaped(row['episode_index'], 20)):
                 yield self._episode(row, crop)
 
     @property
@@ -181,17 +181,17 @@ class DataSet:
         """Return the rows of meta/episodes, or the lines of episodes.jsonl, of so many."""
         found: list[Any] = []
         for file in sorted((self.folder / 'meta' / 'episodes').glob('*/*.parquet'), key=natural):
-            with self.lacking.passing_over('file', f'meta/episodes/{escaped(file.name)}'):
+            with self.skipped.errors_of('file', f'meta/episodes/{escaped(file.name)}'):
                 table = self._read_parquet(file.relative_to(self.folder))
                 for part in table.select([name for name in table.column_names if name.startswith(
                         (*_OF_EPISODES, 'data/', 'videos/'))]).to_batches():
                     found += map(_cut_short, _listed(part))
         if not found and (self.folder / _LINES).exists():
-            with self.lacking.passing_over('file', _LINES):
+            with self.skipped.errors_of('file', _LINES):
                 found = read_bytes(inside(self.folder, _LINES), _MOST_BYTES).splitlines()
         rows: list[dict[str, Any]] = []
         for number, one in enumerate(filter(None, found[:_MOST_EPISODES])):
-            with self.lacking.passing_over('row', f'{number} of meta/episodes'):
+            with self.skipped.errors_of('row', f'{number} of meta/episodes'):
                 row = parse_json(one) if isinstance(one, bytes) else one
                 row = _cut_short(row) | {
                     name: int(row[name]) for name in ('episode_index', 'length')}
@@ -202,7 +202,7 @@ class DataSet:
         if not rows:
             raise RecordingError(f'{escaped(self.folder)}: meta/episodes holds no episode')
         if len(rows) < count:
-            self.lacking.note(f'meta/episodes tells of {len(rows)} of {count} episodes', '', '')
+            self.skipped.note(f'meta/episodes tells of {len(rows)} of {count} episodes', '', '')
         return rows
 
     def _is_deep(self, camera: str) -> bool:
@@ -244,7 +244,7 @@ class DataSet:
         ends: dict[Path, float] = {}  # of the episodes so far
         overlaps = 0
         for row in self.rows:
-            with self.lacking.passing_over('episode', str(row['episode_index'])):
+            with self.skipped.errors_of('episode', str(row['episode_index'])):
                 path = self._path(self._video_path, row, f'videos/{self.camera}')
                 told = float(row.get(f'videos/{self.camera}/from_timestamp', 0.0))
                 if not 0 <= told < 1e6:
@@ -273,7 +273,7 @@ class DataSet:
             size = picture.shape[:2]
             return crop.image(picture)
 
-        frames, kept = decoded(cells, decode, self.lacking, f'episode {row["episode_index"]}')
+        frames, kept = decoded(cells, decode, self.skipped, f'episode {row["episode_index"]}')
         T = len(kept)
 
         def numbers(key: str, width: int) -> np.ndarray:

@@ -26,10 +26,9 @@ from tap_ros.base.files import only_writer, storage_errors
 from tap_ros.base.options import default_text, Folder
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
-from tap_ros.recording.damage import describe, Loss
+from tap_ros.recording.bags import VIDEOS, what_else, what_is
+from tap_ros.recording.defects import Defect, describe
 from tap_ros.recording.episode import Episode, RecordingWarning
-from tap_ros.recording.file_bytes import what_else
-from tap_ros.recording.foreign import VIDEOS, what_is
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading import Part
 from tap_ros.recording.trust import inside, MOST_BYTES, MOST_FRAMES, regular
@@ -98,23 +97,23 @@ def run(args: Options) -> None:
 
     :raises TapError: for what cannot be read, and a folder that holds something.
     """
-    lacking = Lacking()
+    skipped = Skipped()
     files = [file for path in args.paths for file in _of_camera(
         Path(path), find_files(
-            [path], [f'*{end}' for end in VIDEOS], lacking), args.camera)]
+            [path], [f'*{end}' for end in VIDEOS], skipped), args.camera)]
 
     def episodes() -> Iterator[Episode]:
         for number, path in enumerate(sorted(files, key=natural)):
-            with lacking.passing_over('video', escaped(path.name)):
+            with skipped.errors_of('video', escaped(path.name)):
                 seconds: list[float] = []
                 frames, rows = decoded(
-                    _noting(seconds, video_frames(path)), args.cut.image, lacking,
+                    _noting(seconds, video_frames(path)), args.cut.image, skipped,
                     escaped(path.name))
                 yield make_episode(
                     frames, rows / args.fps if args.fps else np.array(seconds)[rows],
                     task=args.task, seed=number)
 
-    print(write_bag(args, episodes(), len(files), lacking))
+    print(write_bag(args, episodes(), len(files), skipped))
 
 
 def _noting(seconds: list[float],
@@ -126,12 +125,12 @@ def _noting(seconds: list[float],
 
 
 def find_files(paths: Iterable[str | Path], patterns: Iterable[str],
-               lacking: 'Lacking') -> list[Path]:
+               skipped: 'Skipped') -> list[Path]:
     """
     Return the regular files that are given, or lie in folders, in the order of their numbers.
 
     :param patterns: of names in folders, in small letters.
-    :param lacking: is told of what is no such file, and of links that lead out of a folder.
+    :param skipped: is told of what is no such file, and of links that lead out of a folder.
     :raises RecordingError: for a folder that holds none.
     """
     found = []
@@ -143,7 +142,7 @@ def find_files(paths: Iterable[str | Path], patterns: Iterable[str],
             raise RecordingError(f'{escaped(path)}: '
                                  f'{what_is(path) or "holds no file " + listing(patterns, 20)}')
         for file in named:
-            with lacking.passing_over('file', escaped(file.name)):
+            with skipped.errors_of('file', escaped(file.name)):
                 if file == path:
                     regular(file)
                 else:
@@ -163,31 +162,31 @@ def _of_camera(path: Path, found: list[Path], camera: str) -> list[Path]:
     return [file for file in found if camera in ('', file.stem)]
 
 
-class Lacking:
+class Skipped:
     """What of an import cannot be used; the rest is written, and this counted and named."""
 
     def __init__(self) -> None:
-        self._losses: list[Loss] = []
+        self._defects: list[Defect] = []
 
     def note(self, why: object, what: str, where: str) -> None:
         """Note why a part cannot be used: what it is, such as a picture, and where it stands."""
-        self._losses.append(Loss(escaped(why), what, where=where))
+        self._defects.append(Defect(escaped(why), what, where=where))
 
     @contextmanager
-    def passing_over(self, what: str, where: str) -> Iterator[None]:
+    def errors_of(self, what: str, where: str) -> Iterator[None]:
         """Note what cannot be read within, and go on behind it; what is read must be whole."""
         try:
             yield
         except DAMAGE as error:
             self.note(error, what, where)
 
-    def tell(self, out: Path, is_empty: bool) -> None:
+    def warn(self, out: Path, is_empty: bool) -> None:
         """
         Warn of what was noted, a line a cause.
 
         :raises RecordingError: when nothing at all could be used.
         """
-        lines = [f'{escaped(out)}: {line}' for line in describe(self._losses)]
+        lines = [f'{escaped(out)}: {line}' for line in describe(self._defects)]
         if is_empty:
             raise RecordingError(
                 lines[0] if lines else f'{escaped(out)}: there is no episode to import')
@@ -195,18 +194,18 @@ class Lacking:
             warnings.warn(line, RecordingWarning, stacklevel=3)
 
 
-def decoded(pictures: Iterable[Any], decode: Callable[[Any], np.ndarray], lacking: Lacking,
+def decoded(pictures: Iterable[Any], decode: Callable[[Any], np.ndarray], skipped: Skipped,
             place: str) -> tuple[list[np.ndarray], np.ndarray]:
     """
     Decode the pictures of an episode, but those that cannot be used.
 
-    :param place: of the episode, for what is noted as lacking.
+    :param place: of the episode, for what is noted as skipped.
     :return: the pictures, and which ones they are, (T,).
     :raises ValueError: when there is none.
     """
     frames, rows, size = [], [], 0
     for row, each in enumerate(pictures):
-        with lacking.passing_over('picture', f'{row} of {place}'):
+        with skipped.errors_of('picture', f'{row} of {place}'):
             frames.append(decode(each))
             rows.append(row)
             size += frames[-1].nbytes
@@ -251,14 +250,14 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
 
 
 def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = None,
-              lacking: Lacking | None = None) -> str:
+              skipped: Skipped | None = None) -> str:
     """
     Write episodes one after the other, in files of EPISODES_PER_FILE: all of them, or nothing.
 
     :param target: Target.
     :param episodes: iterable of Episode, whose stamps count from anywhere.
     :param count: how many there are, to show progress.
-    :param lacking: what could not be used of them, when they have been read.
+    :param skipped: what could not be used of them, when they have been read.
     :return: a line that says what was written.
     :raises ConfigError: for a folder that holds something.
     :raises RecordingError: when there is no episode.
@@ -281,7 +280,7 @@ def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = N
                     writer.write(replace(episode, stamps=stamps))
                     begin, size = int(stamps[-1]) + EPISODE_SPACING_NS, episode.frames.shape[1:3]
                     frames, done = frames + len(episode), done + 1
-            (lacking or Lacking()).tell(out, is_empty=not done)
+            (skipped or Skipped()).warn(out, is_empty=not done)
             write_metadata(part)
             with storage_errors(out):
                 part.rename(out)

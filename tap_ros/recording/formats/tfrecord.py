@@ -31,9 +31,9 @@ from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import (
     decoded,
     find_files,
-    Lacking,
     make_episode,
     Options,
+    Skipped,
     write_bag,
 )
 
@@ -49,22 +49,22 @@ def run(args: Options) -> None:
 
     :raises TapError: for records that cannot be read, and a folder that holds something.
     """
-    camera, blank, lacking = args.camera, Counter[bool](), Lacking()
-    files = find_files(args.paths, ('*.tfrecord*',), lacking)
+    camera, blank, skipped = args.camera, Counter[bool](), Skipped()
+    files = find_files(args.paths, ('*.tfrecord*',), skipped)
     for name in _missing(file for file in files if file not in set(map(Path, args.paths))):
-        lacking.note('it is not there; fetch it, then import again', 'file', name)
+        skipped.note('it is not there; fetch it, then import again', 'file', name)
 
     def episodes() -> Iterator[Episode]:
         nonlocal camera
         numbers = count()
         for file in files:
-            for record, data in read_records(file, lacking):
+            for record, data in read_records(file, skipped):
                 number, place = next(numbers), f'{record} of {escaped(file.name)}'
-                with lacking.passing_over('record', place):
+                with skipped.errors_of('record', place):
                     features = parse_example(data)
                     camera = _choose(features, camera)
                     frames, rows = decoded(
-                        _pictures(features, camera), _picture, lacking, f'record {place}')
+                        _pictures(features, camera), _picture, skipped, f'record {place}')
                     is_blank = _is_blank(frames[0])
                     blank[is_blank] += 1
                     said = features.get('steps/language_instruction') or [args.task.encode()]
@@ -73,7 +73,7 @@ def run(args: Options) -> None:
                             list(map(args.cut.image, frames)), rows / (args.fps or FPS),
                             task=said[0].decode(errors='replace'), seed=number)
 
-    print(f'{write_bag(args, episodes(), lacking=lacking)} of {escaped(camera)}')
+    print(f'{write_bag(args, episodes(), skipped=skipped)} of {escaped(camera)}')
     if blank[True]:
         print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
 
@@ -136,20 +136,20 @@ def _is_blank(picture: np.ndarray) -> bool:
     return bool((picture == picture[0, 0]).all())
 
 
-def read_records(path: Path, lacking: Lacking) -> Iterator[tuple[int, bytes]]:
+def read_records(path: Path, skipped: Skipped) -> Iterator[tuple[int, bytes]]:
     """
     Yield the records of a TFRecord file, each checked against its CRC.
 
     :param path: of the file, not compressed.
-    :param lacking: is told of records that are damaged or cut off.
+    :param skipped: is told of records that are damaged or cut off.
     :return: generator of (number from 0, bytes).
     """
-    with lacking.passing_over('file', escaped(path.name)), open(path, 'rb') as stream:
+    with skipped.errors_of('file', escaped(path.name)), open(path, 'rb') as stream:
         size, number = os.fstat(stream.fileno()).st_size, 0
         if not size:
             raise RecordingError('it is empty; fetch the file again')
         while head := stream.read(12):
-            with lacking.passing_over('record', f'{number} of {escaped(path.name)}'):
+            with skipped.errors_of('record', f'{number} of {escaped(path.name)}'):
                 if len(head) < 12:
                     raise RecordingError('it is cut off; fetch the file again')
                 length, crc = struct.unpack('<QI', head)

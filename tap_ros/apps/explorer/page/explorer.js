@@ -30,14 +30,14 @@ function connect() {
 function take(message) {
   if (message.kind === 'state') {
     state = message;
-    if (problems !== null && message.problem.count > problems) complain(message.problem.text);
+    if (problems !== null && message.problem.count > problems) showError(message.problem.text);
     problems = message.problem.count;
     if (moved && JSON.stringify(state.goal.objects) !== moved.until) moved = null;
     showState();
   } else if (message.kind === 'selection') {
     takeSelection(message);
   } else if (message.kind === 'error') {
-    complain(message.text);
+    showError(message.text);
   }
 }
 
@@ -46,7 +46,7 @@ function send(command) {
   if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(command));
 }
 
-function complain(text) {
+function showError(text) {
   $('error').textContent = text;
   moved = null;
   drawAll();
@@ -70,10 +70,10 @@ function enable(connected) {
 
 function showState() {
   const {run, goal, camera} = state;
-  show('run', run.text, run.running ? 'busy' : '');
+  show('run', run.running ? run.stage || 'starting' : 'idle', run.running ? 'busy' : '');
   enable(true);
   $('camera-note').textContent = camera.note;
-  $('goal-note').textContent = goal.note;
+  $('goal-note').textContent = goal.pictured ? '' : 'none yet';
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
   $('select').hidden = !state.tracker;

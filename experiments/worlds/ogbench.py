@@ -3,18 +3,14 @@
 """
 OGBench's scene, demonstrated by its authors' oracles: cube, drawer, window and button.
 
-Its UR5e has four degrees of freedom and a gripper that ours has not; it can be recorded, not
-planned in.
+It can be recorded, not planned in.
 """
 
 from importlib import import_module
-from typing import Any
 
-import mujoco
 import numpy as np
-from sim_bridge.demonstrations import demonstrate, Demonstration
-from sim_bridge.world.camera import Camera, drawing
-from sim_bridge.world_protocol import Observation
+from sim_bridge.demonstrations import demonstrate
+from sim_bridge.world.camera import Camera, Renderer
 from tap_ros.base.errors import ConfigError, SceneError
 
 TASKS = ('button', 'cube', 'drawer', 'window')
@@ -24,7 +20,7 @@ DRAWS = 1000  # targets that are drawn until one is of the task
 
 class OGBench:
     """
-    The world 'ogbench': a thing on a table with a drawer, a window and two buttons.
+    What `collect` needs of a world: a thing on a table with a drawer, a window and two buttons.
 
     :param task: what the oracle moves, one of TASKS.
     :param image_size: width and height of the pictures in pixels.
@@ -32,40 +28,27 @@ class OGBench:
     :raises SceneError: for an unknown task.
     """
 
-    arm = camera_pose = None
     steps = 2  # of demonstrations
 
-    def __init__(self, task: str = 'cube', image_size: int = 64) -> None:
+    def __init__(self, task='cube', image_size=64):
         if task not in TASKS:
             raise SceneError(f'task {task!r} is unknown; valid: {", ".join(TASKS)}')
         self.task_name = task
         self.env, self.oracle = _make_env(task)
         self.step_ns = round(1e9 * self.env._control_timestep)
         self.reach, self.scale = self.env._arm_sampling_bounds, self.env.action_high[:3]
-        self._info: dict[str, Any] = {}
+        self._info = {}
         self.env.reset(seed=0)  # it makes the model
         self.camera_matrix = Camera(image_size, image_size, fovy=FOVY).K
-        model = self.env._model
-        model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
-        with drawing():
-            self._renderer = mujoco.Renderer(model, image_size, image_size)
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._renderer = Renderer(self.env._model, image_size, image_size)
 
-    def reset(self, seed: int) -> Observation:
-        """Raise SceneError: nothing else than its oracle can act in this world."""
-        raise SceneError('world ogbench: it can be recorded, by `python -m tap_ros collect '
-                         '--world ogbench`, and nothing else')
+    demonstrate = demonstrate
 
-    def demonstrate(self, seed: int, num_frames: int = 0) -> Demonstration:
-        """Let the oracle act as demonstrations.demonstrate says."""
-        return demonstrate(self, seed, num_frames)
-
-    def distances(self) -> np.ndarray:
+    def distances(self):
         """Return nothing: goals are not told."""
         return np.empty(0)
 
-    def begin(self, seed: int) -> None:
+    def begin(self, seed):
         """Begin the scene of a seed, with drawer and window unlocked."""
         env = self.env
         env.reset(seed=seed)
@@ -80,43 +63,43 @@ class OGBench:
         self.oracle._final_pos = env.np_random.uniform(*self.reach)
         self.oracle._final_yaw = env.np_random.uniform(-np.pi, np.pi)
 
-    def act(self, command: np.ndarray) -> None:
+    def act(self, command):
         """Take a step: (5,) of motion, turn and gripper, each in [-1, 1]."""
         *_, self._info = self.env.step(command)
 
-    def command(self) -> np.ndarray:
+    def command(self):
         """Return what the oracle commands now."""
         return np.asarray(self.oracle.select_action(None, self._info), np.float64)
 
-    def hand(self) -> np.ndarray:
+    def hand(self):
         """Return where the fingertips are, (3,) m."""
         return np.array(self._info['proprio/effector_pos'])
 
-    def movable(self) -> np.ndarray:
+    def movable(self):
         """Return where that is which the oracle moves, m."""
         kind, number = self.task_name, self.env._target_button
         return np.array(self._info[{
             'button': f'privileged/button_{number}_pos', 'cube': 'privileged/block_0_pos'}.get(
                 kind, f'privileged/{kind}_pos')])
 
-    def picture(self) -> np.ndarray:
+    def picture(self):
         """Return what a camera in front of the robot sees."""
         self._renderer.update_scene(self.env._data, 'front')
         return self._renderer.render()
 
-    def succeeds(self) -> bool:
+    def succeeds(self):
         """Return whether what the oracle moves is where it shall be."""
         cubes, buttons, drawer, window = self.env._compute_successes()
         return bool({'button': buttons[self.env._target_button], 'cube': cubes[0],
                      'drawer': drawer, 'window': window}[self.task_name])
 
-    def close(self) -> None:
+    def close(self):
         """Free the renderer and the environment."""
         self._renderer.close()
         self.env.close()
 
 
-def _make_env(task: str) -> tuple[Any, Any]:
+def _make_env(task):
     """Return the environment, and the oracle of a task."""
     try:
         from ogbench.manipspace.envs.scene_env import SceneEnv

@@ -15,7 +15,7 @@ CAUSES = 8  # causes named of one file
 
 
 @dataclass(frozen=True)
-class Loss:
+class Defect:
     """
     A part of a file that could not be used.
 
@@ -47,40 +47,38 @@ def seconds(time: int) -> str:
     return f'{sign}{time // 10**9}.{time % 10**9:09d}'
 
 
-def describe(losses: Iterable[Loss]) -> list[str]:
+def describe(defects: Iterable[Defect]) -> list[str]:
     """
-    Put losses in words.
+    Put defects in words.
 
-    :param losses: list of Loss.
-    :return: list of lines, one a kind of cause, with the number of its losses and the first
+    :param defects: list of Defect.
+    :return: list of lines, one a kind of cause, with the number of its defects and the first
         places; of whys that differ in numbers or details the first stands for all.
     """
-    groups: dict[tuple[str, str], list[Loss]] = {}
-    for loss in losses:
-        kind = re.sub(r'\d+', '', loss.why.partition(': ')[0]) if loss.what else loss.why
-        groups.setdefault((loss.what, kind), []).append(loss)
+    groups: dict[tuple[str, str], list[Defect]] = {}
+    for defect in defects:
+        kind = re.sub(r'\d+', '', defect.why.partition(': ')[0]) if defect.what else defect.why
+        groups.setdefault((defect.what, kind), []).append(defect)
     lines = [_line(group[0].what, group[0].why, group) for group in list(groups.values())[:CAUSES]]
     if len(groups) > CAUSES:
         rest = sum(len(group) for group in list(groups.values())[CAUSES:])
-        lines.append(f'{rest} more losses, of {len(groups) - CAUSES} other causes')
+        lines.append(f'{rest} more defects, of {len(groups) - CAUSES} other causes')
     return lines
 
 
-def gaps(losses: Iterable[Loss]) -> np.ndarray:
+def gaps(defects: Iterable[Defect]) -> np.ndarray:
     """
     Return where episodes are cut.
 
-    :param losses: list of Loss.
     :return: (G, 2) int64: first and last log time (ns), -FAR where nothing of the file could be
         read.
     """
-    rows = [[-FAR if time is None else time for time in (loss.start, loss.end)]
-            for loss in losses if loss.cuts]
-    return np.array(rows, np.int64).reshape(-1, 2)
+    return np.array([[-FAR if time is None else time for time in (defect.start, defect.end)]
+                     for defect in defects if defect.cuts], np.int64).reshape(-1, 2)
 
 
-def _line(what: str, why: str, group: Sequence[Loss]) -> str:
-    places = [place for loss in group if (place := loss.place())]
+def _line(what: str, why: str, group: Sequence[Defect]) -> str:
+    places = [place for defect in group if (place := defect.place())]
     more = f' and {len(places) - EXAMPLES} more' if len(places) > EXAMPLES else ''
     where = '; '.join(places[:EXAMPLES]) + more
     if not what:

@@ -1,25 +1,18 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The methods of the paper (section 4), by fields, and their names in results."""
+"""The methods of the paper (section 4) by their names in its tables and in results."""
 
 import re
-from typing import Any, get_args, Literal
 
 from tap_ros.base.errors import ConfigError
-
-Mode = Literal['bidirectional', 'forward']
-MODES = get_args(Mode)
-Loss = Literal['fix', 'min', 'genmin']
-Selection = Literal['absolute', 'relative', 'progress', 'still', 'marks']
-Latent = Literal['none', 'vae']
 
 _NAME = re.compile(r'(?P<loss>fix|min|genmin)(?P<number>\d+(\.\d+)?)?'
                    r'(?P<model>-wo-gan|-vae-gan|-vae)?(\+(?P<selection>relative|progress|still|marks))?')
 
 
-def method_fields(name: str) -> dict[str, Any]:
+def method_fields(name):
     """
-    Turn a method's name into fields of TrainingConfig.
+    Turn a method's name, TrainingConfig.method, into fields of TrainingConfig.
 
     As in the paper's tables, fix, min and genmin alone are trained with l1 and GAN; -wo-gan is l1
     only, -vae the CVAE without GAN (Eq. 9), -vae-gan both (Eq. 10). A number is the fraction of
@@ -42,18 +35,3 @@ def method_fields(name: str) -> dict[str, Any]:
             'latent': 'vae' if model in ('-vae', '-vae-gan') else 'none',
             'fraction': float(number) if number and loss == 'fix' else 0.5,
             'beta': float(number) if number and loss == 'genmin' else 4.0}
-
-
-def method_name(loss: str, selection: str, gan: bool, latent: str, fraction: float,
-                beta: float | None) -> str:
-    """
-    Name a method as the paper's tables do; method_fields reads it.
-
-    :param beta: None where the name does not tell it.
-    """
-    number = {'fix': '' if fraction == 0.5 else f'{fraction:g}',
-              'genmin': '' if beta is None else f'{beta:g}'}.get(loss, '')
-    model = '-vae' + '-gan' * gan if latent == 'vae' else '-wo-gan' * (not gan)
-    chosen = f'+{selection}' if selection == 'marks' or (
-        loss == 'genmin' and selection != 'absolute') else ''
-    return f'{loss}{number}{model}{chosen}'

@@ -24,7 +24,7 @@ function takeSelection({count, followed, objects}) {
     for (const one of objects) {
       if (clicks.every(({u, v}) => Math.hypot(u - one.u, v - one.v) > near)) addClick(one);
     }
-    if (!objects.length) complain('Nothing differs from the goal picture; click each object.');
+    if (!objects.length) showError('Nothing differs from the goal picture; click each object.');
   }
   if (state) drawAll();
 }
@@ -49,7 +49,7 @@ function follow() {
   if (clicks.length) {
     send({do: 'select', objects: clicks.map(({name, u, v}) => ({name, u, v}))});
   } else {
-    complain('Click each object in the camera picture first.');
+    showError('Click each object in the camera picture first.');
   }
 }
 

@@ -3,14 +3,12 @@
 """Laws of scoring trackers; a tracker of another package is scored by its name."""
 
 from importlib.metadata import EntryPoint
-import json
 
+from experiments.tracks import fit_camera, follow, recoveries, summarise
 import numpy as np
 import pytest
-from tap_ros.apps.evaluate_tracking import summarise
 from tap_ros.base import plugins
-from tap_ros.base.errors import ConfigError, TrackingError
-from tap_ros.evaluation.tracks import fit_camera, follow, read_films, recoveries
+from tap_ros.base.errors import TrackingError
 from tap_ros.recording.episode import Episode
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.protocols import LOST, SEEN, Tracked
@@ -65,7 +63,7 @@ class Told:
 
 def scores(**options):
     """Return the values of a told tracker by metric."""
-    track = follow(lambda: Told(**options), made_episode(), 'made')
+    track = follow(lambda: Told(**options), made_episode())
     return {row['metric']: row['value'] for row in summarise([track], 'made')}, track
 
 
@@ -101,16 +99,4 @@ def test_a_tracker_of_another_package_is_found_by_name(monkeypatch):
     monkeypatch.setattr(plugins, 'entry_points', lambda group, name=None: [
         point for name in [name or point.name] if (group, name) == (point.group, point.name)])
     make = plugins.load_plugin('tap_ros.trackers', 'told')
-    assert (follow(lambda: make(None), made_episode(), 'made').errors < 1e-5).all()
-
-
-def test_labels_that_are_none_are_refused(tmp_path):
-    for text in ('[]', '{"films": [{"film": "a.mp4"}]}', '{'):
-        file = tmp_path / 'labels.json'
-        file.write_text(text)
-        with pytest.raises(ConfigError):
-            read_films(file, [tmp_path])
-    file.write_text(json.dumps({'films': [{'film': 'a.mp4', 'objects': ['a'], 'last': 3,
-                                           'labels': {}}]}))
-    with pytest.raises(ConfigError, match='none of the folders'):
-        read_films(file, [tmp_path])
+    assert (follow(lambda: make(None), made_episode()).errors < 1e-5).all()

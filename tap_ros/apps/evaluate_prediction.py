@@ -1,0 +1,171 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m tap_ros evaluate prediction`: score, print, write."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import write_atomically
+from tap_ros.base.options import Bags, File, Flag, Folder, Topic
+from tap_ros.base.text import listing
+from tap_ros.evaluation.hits import score_hits
+from tap_ros.evaluation.intervals import Interval, mean_interval
+from tap_ros.evaluation.prediction import EpisodeScores, evaluate, verdict
+from tap_ros.evaluation.samples import SAMPLES, score_samples
+from tap_ros.evaluation.strips import draw_strips
+from tap_ros.images.crop import trained_crop
+from tap_ros.images.drawing import png_bytes
+from tap_ros.images.robot_mask import trained_robot_mask
+from tap_ros.prediction.networks import PredictorNetwork
+from tap_ros.prediction.predictor import load_network
+from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
+from tap_ros.recording.bags import find_bags, reading_like
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import read_marks
+from tap_ros.training.frames import FilledStore
+from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few, with_masks
+from tap_ros.weights import PREDICTORS
+from tyro import conf
+
+_SHOWN = ('min_l1', 'copying_l1', 'changed_l1', 'match_fraction', 'match_fraction_std',
+          'bottleneck_median', 'bottleneck_1px', 'bottleneck_2px', 'visible_bottleneck_2px',
+          'bottleneck_5px', 'shows_hand', 'shows_objects', 'shows_both')
+_STRIPS = 12  # episodes that are drawn
+_SEEN = 20  # of those trained on, so many are scored, or as many as are held out
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param recordings: bag folders, folders of bag folders, or .mcap files; read as those of the
+        training were.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param all: take every episode, not only those that training held out.
+    :param goal_picture: the episode's last frame, or the goal's own picture where reached, with
+        the arm elsewhere.
+    :param samples: how many to draw of weights with z.
+    :param marks: file of marks (see `mark`) that the matched frames are compared with.
+    :param out: write scores.json and pictures.png there.
+    """
+
+    weights: Annotated[str, conf.arg(
+        metavar='FILE',
+        help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}; or another '
+             'predictor, such as nearest_keyframe:bags/push2, which then has seen those bags.')]
+    recordings: Bags
+    image_topic: Topic = ''
+    all: Flag = False
+    goal_picture: Literal['last', 'recorded'] = 'recorded'
+    samples: int = SAMPLES
+    marks: File = ''
+    out: Folder = ''
+
+
+def run(args: Options) -> None:
+    """
+    Score weights, print a table with copying beside them, and write what --out asks for.
+
+    :raises ConfigError: if there is nothing to score, or the pictures have another size.
+    """
+    network: PredictorNetwork | Predictor
+    if predictor_files(args.weights):
+        network, training = load_network(args.weights)
+        size = network.config.image_size
+        trained = trained_crop(training, (size, size))
+    else:
+        network, training = load_predictor(args.weights), {}
+        size, trained = network.image_size[0], network.camera_crop
+    bags = find_bags(args.recordings)
+    store = open_recordings(bags, reading=reading_like(
+        training, bags, args.image_topic, trained))
+    if store.image_size != (size, size):
+        raise ConfigError(f'{args.weights}: made for {size} pixels a side, '
+                          f'the recordings have {store.image_size}; use matching ones')
+    robot_mask, settings = trained_robot_mask(training)[0], training.get('settings', {})
+    kept, episodes = with_masks(store, split_episodes(
+        store, settings.get('test_fraction', TEST_FRACTION),
+        held_out=() if args.all else settings.get('held_out', ())), robot_mask)
+    if args.all:
+        kept, episodes = kept[:0], np.sort(np.concatenate([kept, episodes]))
+    if not len(episodes):
+        raise ConfigError('recordings: no episode of them was held out from training; '
+                          'give more of them, or --all')
+    marks = read_marks(args.marks, store) if args.marks else None
+    marked = [n for n, i in enumerate(episodes.tolist()) if marks and i in marks.episodes]
+    if marks and not marked:
+        raise ConfigError(
+            'marks: none of the episodes that are scored is marked; mark some of them, in the '
+            f'order of the recordings from 0: {listing(episodes)}; or give --all')
+    filled = None if robot_mask == 'none' else FilledStore(store, robot_mask)
+    scores = evaluate(network, store, episodes, args.goal_picture, filled)
+    sources = {store[i].object_source or 'unknown' for i in episodes if store[i].object_names}
+    _print_table(scores, args.goal_picture, sources)
+    warn_if_few(episodes)
+    seen = None
+    if len(kept) and training.get('data_hash') == store.data_hash:
+        seen = evaluate(network, store, kept[:max(len(episodes), _SEEN)], args.goal_picture,
+                        filled)['prediction']
+    words = verdict(scores['prediction'], seen)
+    if seen is None and not args.all:
+        words.append('training episodes: they are not among these recordings, so nothing tells '
+                     'whether they were memorised')
+    print('\n'.join(words))
+    about: dict[str, Any] = {method: value.summary() | {'intervals': {
+        name: interval[1:] for name, interval in value.intervals().items()}}
+        for method, value in scores.items()}
+    if marks:
+        about['marks'] = score_hits(
+            [marks.episodes[i] for i in episodes[marked].tolist()],
+            store.lengths[episodes[marked]], scores['prediction'].match_step[marked])
+        print(f'the matched frame is a marked one, or within one frame of it, in {len(marked)} '
+              'marked episodes:')
+        for name, hits in about['marks'].items():
+            print(f'{name:22s}' + ''.join(
+                f'{f"{one.value:.0%} ({one.low:.0%}, {one.high:.0%})":>20s}' for one in hits))
+    if isinstance(network, PredictorNetwork) and network.config.latent_size:
+        drawn = score_samples(network, store, episodes, args.goal_picture, args.samples, filled)
+        about['samples'] = {'count': args.samples}
+        for name, title in (('min_l1', f'min_l1, best of {args.samples}'),
+                            ('spread', 'sample spread'), ('spread_px', 'sample spread, px')):
+            values = getattr(drawn, name)
+            if np.isfinite(values).all():
+                interval = mean_interval(values)
+                about['samples'][name] = interval.value
+                print(f'{title:28s}{_text(interval):>20s}')
+    if args.out:
+        result = {'weights': str(args.weights), 'data_hash': store.data_hash,
+                  'goal_picture': args.goal_picture, 'margin': 0, 'verdict': words,
+                  'scores': about}
+        if robot_mask != 'none':
+            result['robot_mask'] = robot_mask
+        write_atomically(Path(args.out, 'scores.json'), json.dumps(result, indent=2) + '\n')
+        write_atomically(Path(args.out, 'pictures.png'), png_bytes(draw_strips(
+            network, store, episodes[:_STRIPS], args.goal_picture, filled, marks)))
+
+
+def _print_table(scores: Mapping[str, EpisodeScores], goal_picture: str,
+                 sources: Iterable[str]) -> None:
+    """Print what was scored, and a line for each metric, a column for each method."""
+    count = len(scores['prediction'].min_l1)
+    print(f'{count} episode{"s" if count > 1 else ""}, goal picture: {goal_picture}; l1 on [0, 1];'
+          + ''.join(f' object positions: {source.replace("_", " ")};'
+                    for source in sorted(sources))
+          + ' in brackets 95% intervals over the episodes')
+    columns = {method: value.intervals() for method, value in scores.items()}
+    print(f'{"":20s}' + ''.join(f'{method:>28s}' for method in columns))
+    for name in _SHOWN:
+        if name in columns['prediction']:
+            print(f'{name:20s}' + ''.join(
+                f'{_text(column[name]) if name in column else "-":>28s}'
+                for column in columns.values()))
+
+
+def _text(interval: Interval) -> str:
+    return '{:.4f} ({:.4f}, {:.4f})'.format(*interval)

@@ -1,0 +1,113 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of bags that ROS 2 keeps in sqlite3; which of both kinds a file is."""
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import closing, suppress
+import os
+from pathlib import Path
+import re
+import sqlite3
+
+from mcap.summary import Summary
+from tap_ros.base.errors import RecordingError
+from tap_ros.base.text import escaped
+from tap_ros.recording.defects import Defect, FAR
+from tap_ros.recording.mcap_file import bytes_of, Channel, Found, McapFile
+from tap_ros.recording.metadata import PACKED
+import zstandard
+
+SQLITE = b'SQLite format 3\0'
+
+
+class SqliteFile(McapFile):
+    """A file of a bag that ROS 2 keeps in sqlite3, read as McapFile reads one of MCAP."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = path
+        self.channels: dict[int, Channel] = {}
+        self.defects: list[Defect] = []
+        self._counts = Counter[int]()
+        self.summary, self._is_read = Summary(), True  # the number of messages is known
+        self._size = os.stat(path).st_size
+        try:
+            with closing(self._open()) as base:
+                self._describe(base)
+        except (sqlite3.Error, ValueError) as error:
+            raise RecordingError(
+                f'{escaped(path)}: cannot be read: {escaped(error)}; copy it again') from error
+
+    def _describe(self, base: sqlite3.Connection) -> None:
+        """Learn of the channels, and how many messages each has."""
+        for name, text in base.execute(  # a view or a formula may have no end
+                "SELECT name, sql FROM sqlite_master WHERE type IN ('table', 'view') "
+                "AND name IN ('topics', 'messages', 'message_definitions')"):
+            if not re.match(r'CREATE TABLE\b', text) or re.search(r'(?i)\bAS\b', text):
+                raise ValueError(f'{name} is no plain table')
+        texts = dict[str, str]()
+        with suppress(sqlite3.Error):  # bags before Iron have none
+            texts = dict(base.execute(
+                'SELECT topic_type, encoded_message_definition FROM message_definitions '
+                "WHERE encoding = 'ros2msg'"))
+        for number, topic, kind, encoding in base.execute(
+                'SELECT id, name, type, serialization_format FROM topics'):
+            text = texts.get(kind, '')
+            if not all(isinstance(word, str) for word in (topic, kind, encoding, text)):
+                raise ValueError('topics holds what is no text')
+            self.channels[number] = Channel(
+                topic, kind, encoding, 'ros2msg' if text else '', text)
+        self._counts.update(dict(base.execute(
+            'SELECT topic_id, count(*) FROM messages GROUP BY topic_id')))
+
+    def _blocks(self) -> Iterator[list[Found]]:
+        try:
+            with closing(self._open()) as base:
+                for number, log, data in base.execute(
+                        'SELECT topic_id, timestamp, data FROM messages ORDER BY id'):
+                    if not isinstance(log, int) or not isinstance(data, bytes):
+                        self.defects.append(Defect('it holds no message', 'row', cuts=False))
+                        continue
+                    self._newest = min(log, FAR)
+                    yield [(number, log, log, memoryview(data))]
+        except sqlite3.Error as error:
+            behind = None if self._newest is None else self._newest + 1
+            self.defects.append(Defect(f'all behind is lost: {escaped(error)}', start=behind,
+                                    end=self._newest))
+
+    def _conclude(self, wanted: Collection[str]) -> None:
+        """Leave it to what _blocks said."""
+
+    def _open(self) -> sqlite3.Connection:
+        """Open the file, with what a killed recorder left beside it; nothing there is changed."""
+        path = Path(self.path)
+        if path.suffix in PACKED:
+            base = sqlite3.connect(':memory:')
+            base.deserialize(bytes_of(path))
+            return base
+        way = 'mode=ro' if path.with_name(f'{path.name}-wal').is_file() else 'immutable=1'
+        return sqlite3.connect(f'{path.absolute().as_uri()}?{way}', uri=True)
+
+
+def open_file(path: Path) -> McapFile:
+    """
+    Open one file of a bag.
+
+    :raises RecordingError: as McapFile.
+    """
+    return (SqliteFile if beginning(path).startswith(SQLITE) else McapFile)(path)
+
+
+def beginning(path: Path) -> bytes:
+    """Return how a file begins, unpacked; nothing of what is no file."""
+    try:
+        if path.is_file():  # opening a FIFO would wait for its writer
+            with open(path, 'rb') as stream:
+                start = stream.read(32)
+                if not start.startswith(zstandard.FRAME_HEADER):
+                    return start
+                stream.seek(0)
+                return zstandard.ZstdDecompressor().stream_reader(stream).read(32)
+    except (OSError, zstandard.ZstdError):
+        pass  # who reads it says why
+    return b''
