@@ -164,7 +164,7 @@ def relative(rows):
 
 
 def lines(found):
-    """Return the lines of the table: claim, paper, here, aim, file, see tables.markdown."""
+    """Return the lines of the table: claim, paper, here, aim."""
     for count in dict.fromkeys(row['demonstrations'] for row in found['curve']):
         rows = [row for row in found['curve'] if row['demonstrations'] == count]
         beside = np.array([row['beside'] for row in rows])
@@ -176,10 +176,8 @@ def lines(found):
 
 def _line(which, rows, more=''):
     ratio = relative(rows)[1]
-    what = '; matched in the bottleneck; at most a frame beside' if more else ''
-    return (f'{which}: error / copying{what}', '',
-            '{:.2f} ({:.2f} to {:.2f})'.format(*ratio) + more,
-            reached(ratio.high < 1, 'below 1'), 'few.json')
+    return (f'{which} demonstrations', '', '{:.2f} ({:.2f} to {:.2f})'.format(*ratio) + more,
+            reached(ratio.high < 1, 'below 1'))
 
 
 def draw(found):

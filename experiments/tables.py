@@ -6,8 +6,8 @@ The tables of docs/results, from the data beside the pages.
     python -m experiments.tables
 
 A page has its sentences from a person, and its table between two marks from here. Numbers have
-their 95% intervals in brackets. Each row names the file that its numbers are of. A row is reached
-if its number is at least the paper's; where the aim is `over` something, if the interval is.
+their 95% intervals in brackets. A row is reached if its number is at least the paper's; where the
+aim is `over` something, if the interval is.
 """
 
 from functools import cache
@@ -58,13 +58,13 @@ def number(row, unit=1.0, digits=0, after='%', sign=''):
     return f'{value}{after} ({low} to {high})'
 
 
-def reached(yes, aim):
+def reached(yes, *aim):
     """Say whether an aim is reached."""
-    return f'{"reached" if yes else "**missed**"}: {aim}'
+    return ': '.join(('reached' if yes else '**missed**', *aim))
 
 
 class Tables:
-    """The lines of each page's table: claim, paper, here, reached or missed, file."""
+    """The lines of each page's table: claim, paper, here, reached or missed."""
 
     def prediction(self):
         """Compare the paper's claims about prediction with what was measured."""
@@ -77,50 +77,50 @@ class Tables:
             return row(method, 'bottleneck_frequency_2px', task, new_pixels=False)
 
         def one(claim, measured, paper=None, said=''):
-            good, aim = ((measured['ci_low'] > 0, 'over 0') if paper is None else
-                         (measured['value'] >= paper, f'{paper:.1%}'.replace('.0%', '%')))
-            return (claim, said if paper is None else aim, number(measured, 100),
-                    reached(good, aim), PREDICTION)
+            if paper is None:
+                return (claim, said, number(measured, 100),
+                        reached(measured['ci_low'] > 0, 'over 0'))
+            return (claim, f'{paper:.1%}'.replace('.0%', '%'), number(measured, 100),
+                    reached(measured['value'] >= paper))
 
         def two(claim, ours, fix):
             return (f'{claim}: `genmin`; `fix`', '', f'{number(ours, 100)}; {number(fix, 100)}',
-                    reached(ours['ci_low'] > fix['ci_high'], 'over `fix`'), PREDICTION)
+                    reached(ours['ci_low'] > fix['ci_high'], 'over `fix`'))
 
         plain = OURS.format('')
         for method, network in ((plain, ''), ('genmin', "the paper's network with GAN, ")):
             for task, title in TASKS.items():
-                yield one(f'error of `genmin` below `fix`: {network}{title}',
-                          row(method, task=task), GAINS[task])
+                yield one(f'`genmin` below `fix`: {network}{title}', row(method, task=task),
+                          GAINS[task])
         for task, title in TASKS.items():
-            yield one(f'error of `genmin` below `fix` at the same match-step: {title}',
-                      row(plain, 'gain_over_fix_at_match_step', task))
+            yield one(f'`genmin` below `fix` at the same match-step: {title}', row(
+                plain, 'gain_over_fix_at_match_step', task))
         for task, title in {'stack2': 'stacking two blocks', 'push3': 'pushing three'}.items():
-            yield one(f'error of `genmin` below `fix`: {title}', row(plain, task=task))
+            yield one(f'`genmin` below `fix`: {title}', row(plain, task=task))
         yield two('predictions that show hand and object, pick-and-place',
                   *(row(method, 'shows_both', 'pick_place') for method in (plain, FIX)))
-        yield one('from the start alone, grasping: error of `genmin`, beta 4, below fixed times '
-                  'at the same match-step', row(
+        yield one('`genmin`, beta 4, below fixed times at the same match-step: grasping, from '
+                  'the start alone', row(
                       'genmin4-wo-gan+skips', 'gain_over_fix_at_match_step', 'grasp',
                       mode='forward'), said='lower')
-        bottlenecks = 'bottlenecks found to 2 px, pushing two objects'
+        bottlenecks = 'bottlenecks found, pushing two objects'
         for name, method in (('', plain), (' over progress', PROGRESS),
                              (' relative to copying', RELATIVE)):
             yield one(f'{bottlenecks}: `genmin`{name}', found(method), BOTTLENECK_2PX['genmin'])
         yield (f'{bottlenecks}: `fix` finds none', f'{BOTTLENECK_2PX["fix"]:.0%}',
-               number(found(FIX), 100), reached(found(FIX)['value'] == 0, '0%'), PREDICTION)
+               number(found(FIX), 100), reached(found(FIX)['value'] == 0))
         for task, title in (('push2_late', 'late in the recordings'),
                             ('push2_mixed', 'at any time'),
                             ('order2', 'two objects in order'), ('push3', 'three objects')):
             yield two(f'bottlenecks found, {title}, relative to copying', found(RELATIVE, task),
                       found(FIX, task))
         for task, form in (('grasp', ''), ('pick_place', '+narrow'), ('push2', '+frame')):
-            yield one(f'error of the best of 100 samples below the best without: {TASKS[task]}',
+            yield one(f'best of 100 samples below the best without: {TASKS[task]}',
                       row(f'genmin-vae-wo-gan-best-of-100+skips{form}',
                           'gain_over_deterministic', task), said='lower')
         for method, title in zip(PIECES, ('whole episodes', 'pieces of episodes'), strict=True):
-            yield one('recursion, pick-and-place, over progress: the pick comes before the place, '
-                      f'trained on {title}', row(method, 'pick_after_place', 'pick_place'),
-                      said='shown')
+            yield one(f'recursion, pick-and-place, over progress, trained on {title}: pick before '
+                      'place', row(method, 'pick_after_place', 'pick_place'), said='shown')
 
     def planning(self):
         """Compare the paper's claims about planning with what was measured."""
@@ -141,7 +141,7 @@ class Tables:
                    'difference', '{} cm; {} cm; {:.1f} cm'.format(*paper, paper[1] - paper[0]),
                    '; '.join(number(row, 1, 1, ' cm') for row in (
                        final(task, 'direct'), final(task, 'shipped'), less)),
-                   reached(less['ci_high'] < 0, 'nearer'), PLANNING)
+                   reached(less['ci_high'] < 0, 'nearer'))
         for task, shipped, title in (
                 ('push2', 'shipped', 'two objects anywhere'),
                 ('push3', 'shipped', 'three objects anywhere'),
@@ -150,35 +150,34 @@ class Tables:
             more = success(task, shipped, compares='direct')
             yield (f'success, {title}: direct; via the subgoal; difference', '', '; '.join((
                 number(success(task, 'direct'), 100), number(success(task, shipped), 100),
-                points(more))), reached(more['ci_low'] > 0, 'over direct'), PLANNING)
+                points(more))), reached(more['ci_low'] > 0, 'over direct'))
         late3 = 'order3', 'fix+late:rounds2', 'genmin+relative+late:rounds2'
         for task, fix, ours, title, *file in (
                 ('order2', 'fix', 'shipped', 'two in order'),
                 ('order3', 'fix+rounds:rounds2', 'shipped:rounds2', 'three in order'),
                 ('order2', 'fix+rounds', 'genmin+relative+rounds', 'two in order, trained alike'),
-                ('order2', 'fix+late', 'genmin+relative+late',
-                 'two in order, trained on late bottlenecks'),
-                (*late3, 'three in order, trained on late bottlenecks', LATE)):
+                ('order2', 'fix+late', 'genmin+relative+late', 'two in order, late'),
+                (*late3, 'three in order, late', LATE)):
             more = success(task, ours, *file, compares='fix')
             yield (f'success, {title}: via `fix`; via the subgoal minus via `fix`', '', '; '.join((
                 number(success(task, fix, *file), 100), points(more))),
-                reached(more['value'] >= 0.2, '20 points'), *(file or [PLANNING]))
+                reached(more['value'] >= 0.2, '20 points'))
         for compares, title in (('fix', 'via `fix`'), ('direct', 'direct')):
             more = [success('order2', f'genmin+relative+late{seed}', file, compares=compares)
                     for seed, file in (('', PLANNING), ('-s1', LATE), ('-s2', LATE))]
-            yield ('success, two in order, trained on late bottlenecks, three trainings: via the '
-                   f'subgoal minus {title}', '', '; '.join(map(points, more)), reached(
+            yield (f'success, two in order, late, three trainings: via the subgoal minus {title}',
+                   '', '; '.join(map(points, more)), reached(
                        sum(row['value'] for row in more) / 3 >= 0.2
-                       and min(row['ci_low'] for row in more) > 0, '20 points'), LATE)
+                       and min(row['ci_low'] for row in more) > 0, '20 points'))
         more = success(*late3[::2], LATE, compares='direct')
-        yield ('success, three in order, trained on late bottlenecks: via the subgoal minus '
-               'direct', '', points(more), reached(more['value'] >= 0.2, '20 points'), LATE)
+        yield ('success, three in order, late: via the subgoal minus direct', '', points(more),
+               reached(more['value'] >= 0.2, '20 points'))
         yield ('success in order, told the right order: two; three objects', '', '; '.join(
             number(success(task, 'oracle_order'), 100) for task in ('order2', 'order3')),
-            'to compare', PLANNING)
+            'to compare')
         yield ('success with the simulator as forward model, direct: two anywhere; two in order',
                '', '; '.join(number(success(task, 'true_model'), 100)
-                             for task in ('push2', 'order2')), 'to compare', PLANNING)
+                             for task in ('push2', 'order2')), 'to compare')
 
     def stacking(self):
         """Say how many towers stand."""
@@ -195,20 +194,20 @@ class Tables:
         for method, title in methods.items():
             stands, first = row('stack3', method), row('stack3', method, 'first_right')
             aimed = reached(stands['ci_low'] > direct['ci_high'], 'over the goal picture alone')
-            yield (f'a tower of three: {title}', '', f'{number(stands, 100)}; first move right '
-                   f'{number(first, 100)}', aimed if 'shipped' in method else 'to compare',
-                   STACKING)
+            yield (f'three blocks: {title}; first move right', '',
+                   f'{number(stands, 100)}; {number(first, 100)}',
+                   aimed if 'shipped' in method else 'to compare')
         for other, title, least, aim in (('fix', 'via `fix`', 0.2, '20 points'),
                                          ('lowest_first', 'the rule', 0, 'over the rule')):
             more = row('stack3', 'shipped', 'success_difference', against=other)
-            yield (f'a tower of three: via one subgoal minus {title}', '',
+            yield (f'three blocks: via one subgoal minus {title}', '',
                    number(more, 100, 0, ' points', '+'),
-                   reached(more['value'] >= least and more['ci_low'] > 0, aim), STACKING)
-        for task, title in (('stack2', 'one block on another'), ('pick_place', 'one object')):
+                   reached(more['value'] >= least and more['ci_low'] > 0, aim))
+        for task, title in (('stack2', 'two blocks'), ('pick_place', 'one object')):
             yield (f'{title}: the goal picture alone; via one subgoal; via two', '', '; '.join(
                 number(row(task, method), 100)
                 for method in ('direct', 'shipped', 'shipped:recursion2')),
-                'to compare', STACKING)
+                'to compare')
 
     def speed(self):
         """List what `make bench` measured."""
@@ -216,10 +215,10 @@ class Tables:
             yield Row(**row).cells
 
 
-def markdown(lines, head=('claim', 'paper', 'here', 'aim', 'file')):
-    """Write lines as a table, with a link to its file at the end of each."""
-    if head[-1] == 'file':
-        lines = ((*cells, f'[data]({file})') for *cells, file in lines)
+def markdown(lines, head=('claim', 'paper', 'here', 'aim')):
+    """Write lines as a table, without the columns that are empty."""
+    columns = [column for column in zip(head, *lines, strict=True) if any(column[1:])]
+    head, *lines = zip(*columns, strict=True)
     return ''.join(f'| {" | ".join(row)} |\n' for row in (head, ('---',) * len(head), *lines))
 
 

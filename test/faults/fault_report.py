@@ -27,16 +27,15 @@ MAX_REASONS = 4
 HEAD = """\
 # Faults
 
-Each row is a fault that was injected into real nodes, processes of their own that talk over DDS,
-or into a disk. *Held*: trials in which what must happen did happen, and no node logged a traceback
-or an error that the fault does not explain. Numbers are the worst of all trials unless said
-otherwise. Made by `{command}` in {minutes:.0f} minutes, {dates}, commit {commits}, on
-{machines}; [faults.json](faults.json) has each row's. `python -m pytest -m fault` tries each fault
-a few times. Damaged recordings and weights are in `make test`.
+Each row is a fault that was injected into real nodes, processes that talk over DDS, or into a
+disk. *Held*: trials in which what must happen did happen, and no node logged a traceback or an
+error that the fault does not explain. *Seen*: the worst of all trials unless said otherwise. Made
+by `{command}` in {minutes:.0f} minutes, {dates}, commit {commits},
+on {machines}; [faults.json](faults.json) has each row's.
 
 ![slowest reaction of all trials, and what was promised](faults.png)
 
-*The slowest reaction of all trials (bars) and what was promised (lines).*
+*The slowest reaction (bars) and what was promised (lines).*
 
 | injected | must happen | held | seen |
 | --- | --- | ---: | --- |

@@ -16,8 +16,8 @@ def test_the_page_is_made_from_the_rows():
     assert page(rows) == text
     lines = [line for line in text.splitlines() if line.startswith('| ')][2:]
     missed = sum('**' in line for line in lines)
-    assert (f'Faults of {len(lines)} kinds end as they should. | '
-            f'{len(lines) - missed} in all trials' in (RESULTS / 'README.md').read_text())
+    assert (f'Of {len(lines)} kinds of faults {len(lines) - missed} end as they should in all '
+            'trials' in (RESULTS / 'README.md').read_text())
 
 
 def test_a_trial_holds_unless_something_is_raised(tmp_path):
