@@ -17,6 +17,7 @@ from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File, Folder, Topic
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.formats.lerobot_subtasks import segment_names, write_subtasks
 from tap_ros.recording.marks import beside, numbered, read_marks
 from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import (
@@ -48,6 +49,8 @@ class Options:
     :param marks: file of `python -m tap_ros mark`; by default the one beside the first recording.
     :param out: folder for labels.json, labels.csv and labels.png.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param write_lerobot: the LeRobot data set from which the recording was imported: its rows get
+        the subtasks that the labels tell apart.
     """
 
     recordings: Annotated[conf.Positional[tuple[str, ...]], conf.arg(
@@ -55,6 +58,7 @@ class Options:
     out: Folder
     marks: File = ''
     image_topic: Topic = ''
+    write_lerobot: Folder = ''
 
 
 def run(options: Options) -> None:
@@ -90,6 +94,13 @@ def run(options: Options) -> None:
         'names': names, 'marks': marks.digest, 'labels': rows}, indent=1) + '\n')
     write_atomically(out / 'labels.csv', to_csv(rows))
     write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
+    if options.write_lerobot:
+        names_of_parts = segment_names(names)
+        rows_written = write_subtasks(options.write_lerobot, names_of_parts, {
+            i: moments.tolist() for i, moments in enumerate(labels.moments)
+            if films[i] is not None})
+        print(f'{options.write_lerobot}: {rows_written} rows with the subtasks '
+              f'{", ".join(names_of_parts)}')
     print(worth([(film, marked[i]) for i in marked if (film := films[i]) is not None], names))
     print(f'{out}: {len(store)} demonstrations labelled; look at labels.png: numbers cannot tell '
           'whether all marks are early or late')
