@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Subtasks in a LeRobot data set: all else stays, they come back as marks, half is never written."""
+"""Subtasks in a LeRobot data set: all else stays, and they come back as marks."""
 
 import json
 

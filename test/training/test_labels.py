@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of labels: moments are found, in their order, at any rate, and their command writes them."""
+"""Laws of labels: moments are found, in their order and at any rate."""
 
 import csv
 from dataclasses import replace
@@ -19,7 +19,7 @@ COUNT, MARKED = 16, 8
 
 
 def two_moves(seed, rate=10):
-    """Draw frames in which one square moves, then the other; return stamps and both ends (2,) s."""
+    """Draw one square that moves, then another; return frames, stamps in ns, ends (2,) s."""
     rng = np.random.default_rng(seed)
     rest, first, pause, second, end = rng.uniform((.8, 1, .8, 1, .8), (2, 2, 2, 2, 2))
     times = np.arange(0, rest + first + pause + second + end, 1 / rate)

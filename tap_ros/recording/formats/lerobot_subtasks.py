@@ -48,7 +48,7 @@ def write_subtasks(folder: str | Path, names: Sequence[str],
     try:
         info = parse_json(read_bytes(inside(root, INFO), _MOST_BYTES))
         info['features'][COLUMN] = {'dtype': 'int64', 'shape': [1], 'names': None}
-    except (OSError, LookupError, TypeError, ValueError) as error:
+    except (OSError, RecordingError, LookupError, TypeError, ValueError) as error:
         raise RecordingError(
             f'{escaped(root)}: is no LeRobot data set: {escaped(error)}') from error
     done: dict[Path, Path] = {}
