@@ -41,6 +41,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                        'tap_ros.recording.formats.lerobot_export'),
     'mark': ('mark the bottleneck in a few demonstrations, on a page in the browser',
              'tap_ros.apps.mark_command'),
+    'label': ('from ten marks to labels in all demonstrations', 'tap_ros.apps.label_command'),
     'train': ('train on recordings', {
         'predictor': ('train a subgoal predictor', 'tap_ros.apps.train:predictor'),
         'forward': ("train the planner's forward model", 'tap_ros.apps.train:forward'),

@@ -18,7 +18,7 @@ from tap_ros.base.errors import ConfigError, ImageError
 from tap_ros.base.text import escaped
 from tap_ros.images.pixels import resize_image, resize_pixels
 
-CENTRE = 'centre'
+CENTRE, WHOLE = 'centre', 'whole'
 MAX_SIZE = 4096  # px, of a side
 
 
@@ -28,7 +28,8 @@ class Crop:
     A square part of pictures, scaled; by default pictures stay as they are.
 
     :param part: 'centre': the largest square in the middle; 'LEFT,TOP,SIDE': that square, in
-        pixels of the camera; '': the whole picture.
+        pixels of the camera; 'whole': all of it, which size squeezes into a square; '': all of
+        it, which has to be square if it is scaled.
     :param size: pixels a side after scaling; 0: not scaled.
     :raises ConfigError: for another part, or a size that no picture has.
     """
@@ -38,7 +39,7 @@ class Crop:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be cut."""
-        if self.part not in ('', CENTRE):
+        if self.part not in ('', CENTRE, WHOLE):
             numbers = re.fullmatch(r'(\d{1,5}),(\d{1,5}),([1-9]\d{0,4})', self.part)
             if numbers is None:
                 raise ConfigError(
@@ -63,13 +64,13 @@ class Crop:
         if self.part == CENTRE:
             side = min(height, width)
             return (width - side) // 2, (height - side) // 2, side, side
-        if self.part:
+        if self.part not in ('', WHOLE):
             left, top, side = map(int, self.part.split(','))
             if left + side > width or top + side > height:
                 raise ImageError(f'crop {self.part} reaches beyond a picture of {width}x{height} '
                                  'pixels (width x height)')
             return left, top, side, side
-        if self.size and height != width:
+        if self.size and height != width and self.part != WHOLE:
             raise ImageError(
                 f'pictures of {width}x{height} pixels (width x height) are not square; training '
                 f'says which square of them is used, by --crop {CENTRE} or --crop LEFT,TOP,SIDE')

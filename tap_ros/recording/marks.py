@@ -13,6 +13,7 @@ and so can a person:
 
 A recording is a path from the folder of the file; its episodes count from 0. Stamps are seconds,
 of the camera's messages: one a mark, in order of time, or [first, last] of a mark that lasts.
+Before "marks" there may be the names of an episode's marks: "names": ["grasp", "release"].
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -44,10 +45,12 @@ class Marks:
 
     :param episodes: index of an episode: its marks, in order of time.
     :param digest: SHA-256 of the file that they come from.
+    :param names: of the marks of each episode, in order; () where they have none.
     """
 
     episodes: Mapping[int, Sequence[Mark]]
     digest: str
+    names: tuple[str, ...] = ()
 
 
 def beside(recording: str | Path) -> Path:
@@ -66,8 +69,11 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
     name = escaped(path)
     try:
         data = read_bytes(path, _MOST_BYTES)
-        entries = parse_json(data)['marks']
+        content = parse_json(data)
+        entries, names = content['marks'], content.get('names', [])
         found = [(entry['recording'], entry['episode'], entry['stamps']) for entry in entries]
+        if not all(isinstance(name, str) and name for name in names):
+            raise TypeError
         if not all(isinstance(one[0], str) and isinstance(one[1], int) for one in found):
             raise TypeError
     except OSError as error:
@@ -88,7 +94,7 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
         except (TypeError, ValueError, OverflowError, RuntimeError, OSError) as error:
             raise ConfigError(f'{name}: mark {number} (recording {escaped(recording, 60)}, episode'
                               f' {escaped(episode, 20)}): {error}') from error
-    return Marks(episodes, hashlib.sha256(data).hexdigest())
+    return Marks(episodes, hashlib.sha256(data).hexdigest(), tuple(names))
 
 
 def _episode(store: 'EpisodeStore', folder: Path, recording: str, episode: int) -> int:
@@ -134,6 +140,16 @@ def _inside(store: 'EpisodeStore', place: Path) -> list[int]:
             if place in ((file := store.source(i).resolve()), *file.parents)]
 
 
+def numbered(store: 'EpisodeStore', recordings: Iterable[str | Path],
+             folder: Path) -> dict[int, tuple[str, int]]:
+    """Return of each episode its recording, as a path from a folder, and its number in it."""
+    numbers: dict[int, tuple[str, int]] = {}
+    for recording in recordings:
+        for number, i in enumerate(_inside(store, Path(recording))):
+            numbers.setdefault(i, (os.path.relpath(Path(recording).resolve(), folder), number))
+    return numbers
+
+
 def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[str | Path],
                 episodes: Mapping[int, Sequence[Mark]]) -> None:
     """
@@ -143,11 +159,7 @@ def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[st
     :param episodes: as in Marks.
     :raises StorageError: when it cannot be written; an existing file is then what it was.
     """
-    folder = Path(path).resolve().parent
-    numbers: dict[int, tuple[str, int]] = {}
-    for recording in recordings:
-        for number, i in enumerate(_inside(store, Path(recording))):
-            numbers.setdefault(i, (os.path.relpath(Path(recording).resolve(), folder), number))
+    numbers = numbered(store, recordings, Path(path).resolve().parent)
     lines = []
     for i, marks in sorted(episodes.items()):
         seconds = [[round(store[i].stamps[t] / 1e9, 6) for t in mark] for mark in marks]

@@ -4,7 +4,11 @@
 
 import os
 from pathlib import Path
+import signal
 import struct
+import subprocess
+import sys
+import time
 import warnings
 
 import cv2
@@ -162,3 +166,22 @@ def test_real_recordings_can_be_trained_on(words, tmp_path, capsys):
                       '--crop', 'centre', '--size', 64)[0] == 0
     code, said = run_import(capsys, 'inspect', bag)
     assert code == 0 and 'episodes to learn from' in said
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
+def test_an_import_that_is_ended_leaves_nothing_in_the_way_of_the_next(tmp_path, number):
+    set_, bag = tmp_path / 'set', tmp_path / 'bag'
+    set_.mkdir()
+    for k in range(30):
+        write_video(set_ / f'{k:02}.avi', make_frames(k, 40, 128), 10)
+    command = [sys.executable, '-m', 'tap_ros', 'import-video', str(set_), '--out', str(bag)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    while not any(bag.glob('*.mcap*')) and process.poll() is None:
+        time.sleep(0.01)
+    process.send_signal(number)
+    assert process.wait(60) == (130 if number == signal.SIGINT else -number)
+    assert bag.exists() == (number == signal.SIGKILL)
+    assert subprocess.run(command, stderr=subprocess.DEVNULL).returncode == 0
+    assert len(open_recordings([bag], progress=False)) == 30
+    names = {path.name for path in bag.iterdir()}
+    assert names == {'bag_0.mcap', 'bag_1.mcap', 'metadata.yaml'}

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 import os
 from pathlib import Path
-import shutil
+import re
 from typing import Annotated, Any
 import warnings
 
@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from tap_ros.base.contract import MAX_PICTURE_BYTES
 from tap_ros.base.errors import ConfigError, ImageError, RecordingError
-from tap_ros.base.files import only_writer, storage_errors
+from tap_ros.base.files import only_writer
 from tap_ros.base.options import default_text, Folder
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
@@ -250,6 +250,14 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
                    **(fields | known))
 
 
+def _is_free(folder: Path) -> bool:
+    """Return whether a folder holds nothing, or what an import has left that was killed."""
+    names = [path.name for path in folder.iterdir()]
+    ours = re.compile(rf'{re.escape(folder.resolve().name)}_\d+\.mcap(\.part)?')
+    return not names or (all(map(ours.fullmatch, names))
+                         and any(name.endswith('.part') for name in names))
+
+
 def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
               count: int | None = None) -> str:
     """
@@ -263,30 +271,32 @@ def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
     :raises ConfigError: for a folder that holds something.
     :raises RecordingError: when there is no episode.
     """
-    out, begin, frames, done = Path(target.out), 10**9, 0, 0
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    out, begin, frames, done, size = Path(target.out), 10**9, 0, 0, (0, 0)
+    if out.exists() and not (out.is_dir() and _is_free(out)):
         raise ConfigError(f'--out {escaped(out)}: is not empty; name a new folder')
-    size, part = (0, 0), out.resolve().with_name(out.resolve().name + '.part')
-    with only_writer(part):
+    is_new, whole = not out.exists(), False
+    with only_writer(out):
         try:
-            for old in part.iterdir():
+            for old in out.iterdir():
                 old.unlink()  # of an import that was killed
             with ExitStack() as stack:
                 for episode in tqdm(episodes, 'importing', count, unit='episode', delay=1):
                     if done % EPISODES_PER_FILE == 0:
                         stack.close()
-                        writer = stack.enter_context(EpisodeWriter(
-                            part / f'{out.resolve().name}_{done // EPISODES_PER_FILE}.mcap'))
+                        name = f'{out.resolve().name}_{done // EPISODES_PER_FILE}.mcap'
+                        writer = stack.enter_context(EpisodeWriter(out / name))
                     stamps = episode.stamps - episode.stamps[0] + begin
                     writer.write(replace(episode, stamps=stamps))
                     begin, size = int(stamps[-1]) + EPISODE_SPACING_NS, episode.frames.shape[1:3]
                     frames, done = frames + len(episode), done + 1
             skipped.warn(out, is_empty=not done)
-            write_metadata(part)
-            with storage_errors(out):
-                part.rename(out)
+            write_metadata(out)
+            whole = True
         finally:
-            shutil.rmtree(part, ignore_errors=True)
+            for file in () if whole else out.iterdir():
+                file.unlink(missing_ok=True)
+            if is_new and not whole:
+                out.rmdir()
     return f'{escaped(out)}: {done} episodes, {frames} frames of {size[1]}x{size[0]} pixels'
 
 

@@ -1,0 +1,187 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m tap_ros label`: from ten marks to a label in every demonstration."""
+
+from collections.abc import Sequence
+import csv
+from dataclasses import dataclass
+import io
+import json
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.files import write_atomically
+from tap_ros.base.options import File, Folder, Topic
+from tap_ros.images.drawing import png_bytes
+from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.formats.lerobot_subtasks import segment_names, write_subtasks
+from tap_ros.recording.marks import beside, numbered, read_marks
+from tap_ros.recording.reading import Reading
+from tap_ros.training.labels import (
+    choose_grey,
+    Film,
+    film_of,
+    label,
+    Labels,
+    leave_one_out,
+    moments_of,
+)
+from tqdm import tqdm
+from tyro import conf
+
+SIZE = 64  # px a side of the pictures that are described: whole ones, squeezed into a square
+WITHIN_S = (0.3, 0.5, 1.0)  # of which the share of labels is told
+SHEET_SIZE = 96, 128  # px, height and width, of a picture in the contact sheet
+SHEET_ROWS = 40  # demonstrations in it, at most
+BEFORE_AND_AFTER_S = (-0.5, 0.0, 0.5)
+_LINE = 14  # px of a line of text
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param recordings: .mcap files, bag folders, or folders of these.
+    :param marks: file of `python -m tap_ros mark`; by default the one beside the first recording.
+    :param out: folder for labels.json, labels.csv and labels.png.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param write_lerobot: the LeRobot data set from which the recording was imported: its rows get
+        the subtasks that the labels tell apart.
+    """
+
+    recordings: Annotated[conf.Positional[tuple[str, ...]], conf.arg(
+        metavar='BAG [BAG ...]', help_behavior_hint='(required)')]
+    out: Folder
+    marks: File = ''
+    image_topic: Topic = ''
+    write_lerobot: Folder = ''
+
+
+def run(options: Options) -> None:
+    """
+    Label the demonstrations, and say how far off a label is to be expected.
+
+    :raises TapError: for recordings or marks that cannot be used.
+    """
+    store = open_recordings(options.recordings, reading=Reading(
+        image_topic=options.image_topic, crop='whole', size=SIZE))
+    path = Path(options.marks) if options.marks else beside(options.recordings[0])
+    marks = read_marks(path, store)
+    marked = {i: np.array([seconds_of(store, i, (first + last) // 2) for first, last in those])
+              for i, those in marks.episodes.items()}
+    counts = {len(one) for one in marked.values()}
+    if len(counts) != 1:
+        raise ConfigError(f'{path}: expected as many marks in each demonstration, got from '
+                          f'{min(counts)} to {max(counts)}')
+    names = marks.names or tuple(f'mark {k + 1}' for k in range(counts.pop()))
+    films = [film_of(store, i) for i in tqdm(
+        range(len(store)), desc='describing', unit='demonstration', delay=1)]
+    labels = label(films, marked, names)
+    out = Path(options.out)
+    out.mkdir(parents=True, exist_ok=True)
+    places = numbered(store, options.recordings, out)
+    rows = [{'recording': places[i][0], 'episode': places[i][1], 'name': name,
+             'seconds': round(float(second), 3), 'stamp': round(
+                 int(store[i].stamps[0]) / 1e9 + float(second), 6),
+             'confidence': round(float(sure), 3), 'marked': i in marked}
+            for i in range(len(store)) if films[i] is not None
+            for name, second, sure in zip(names, labels.moments[i], labels.confidence[i])]
+    write_atomically(out / 'labels.json', json.dumps({
+        'names': names, 'marks': marks.digest, 'labels': rows}, indent=1) + '\n')
+    write_atomically(out / 'labels.csv', to_csv(rows))
+    write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
+    if options.write_lerobot:
+        names_of_parts = segment_names(names)
+        rows_written = write_subtasks(options.write_lerobot, names_of_parts, {
+            i: moments.tolist() for i, moments in enumerate(labels.moments)
+            if films[i] is not None})
+        print(f'{options.write_lerobot}: {rows_written} rows with the subtasks '
+              f'{", ".join(names_of_parts)}')
+    print(worth([(film, marked[i]) for i in marked if (film := films[i]) is not None], names))
+    print(f'{out}: {len(store)} demonstrations labelled; look at labels.png: numbers cannot tell '
+          'whether all marks are early or late')
+
+
+def seconds_of(store: EpisodeStore, i: int, frame: int) -> float:
+    """Return when a frame of an episode is, in s from its first one."""
+    stamps = store[i].stamps
+    return float(stamps[frame] - stamps[0]) / 1e9
+
+
+def to_csv(rows: Sequence[dict[str, object]]) -> str:
+    """Return rows as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def worth(marked: Sequence[tuple[Film, np.ndarray]], names: Sequence[str]) -> str:
+    """
+    Return in words how far off labels are, by leaving out each marked demonstration once.
+
+    :param marked: Film and marks (M,) s of each.
+    """
+    from scipy.stats import binomtest  # takes a second to import
+    films, moments = map(list, zip(*marked))
+    if len(films) < 3:
+        return f'{len(films)} marked demonstrations do not tell how good labels are; mark ten'
+    found = leave_one_out(films, moments, choose_grey(films, moments))
+    lines = [f'Each of {len(films)} marked demonstrations, labelled by the others: share of labels'
+             f' within {", ".join(f"{s:g}" for s in WITHIN_S)} s (95%), median error']
+    for m, name in enumerate(names):
+        true = np.array([one[m] for one in moments])
+        ends = np.array([film.stamps[-1] for film in films])
+        shares = true / ends
+        guesses = {
+            'label': [moments_of(film, posterior)[0][m] for film, _, posterior in found],
+            'fixed share of the time': [
+                end * np.median(np.delete(shares, i)) for i, end in enumerate(ends)],
+            'slowest frame': [film.stamps[film.slowest] for film in films]}
+        random = float(np.mean([film.near(second, WITHIN_S[1])
+                                for film, second in zip(films, true)]))
+        told = True
+        for way, guess in guesses.items():
+            errors = np.abs(np.array(guess) - true)
+            hits = [int((errors <= s + 1e-6).sum()) for s in WITHIN_S]
+            spans = [binomtest(k, len(errors)).proportion_ci(method='wilson') for k in hits]
+            told &= way != 'label' or spans[1].low > random
+            lines.append(f'  {name}, {way}: ' + ', '.join(
+                f'{k / len(errors):.0%} ({low:.0%} to {high:.0%})'
+                for k, (low, high) in zip(hits, spans)) + f'; {np.median(errors):.2f} s')
+        lines.append(f'  {name}, random frame: {random:.0%} within {WITHIN_S[1]:g} s'
+                     + ('' if told else '; labels are not told from chance: mark more '
+                        'demonstrations, or other moments'))
+    return '\n'.join(lines)
+
+
+def contact_sheet(store: EpisodeStore, labels: Labels, marked: set[int]) -> np.ndarray:
+    """
+    Draw the labelled moments, the least certain first: .5 s before, at, and .5 s after each.
+
+    :return: uint8 (height, width, 3) rgb.
+    """
+    usable = [i for i in range(len(store)) if len(labels.log_likelihood[i][0])]
+    order = sorted(usable, key=lambda i: (i in marked, labels.confidence[i].min()))[:SHEET_ROWS]
+    rows = []
+    for i in order:
+        frames, stamps = store.frames(i), (store[i].stamps - store[i].stamps[0]) / 1e9
+        row = []
+        for name, second, sure in zip(labels.names, labels.moments[i], labels.confidence[i]):
+            for offset in BEFORE_AND_AFTER_S:
+                frame = frames[np.abs(stamps - second - offset).argmin()]
+                panel = np.full((SHEET_SIZE[0] + _LINE, SHEET_SIZE[1], 3), 255, np.uint8)
+                panel[_LINE:] = cv2.resize(frame, SHEET_SIZE[::-1], interpolation=cv2.INTER_AREA)
+                text = f'{i} {name} {second:.1f} s ' + ('marked' if i in marked else f'{sure:.0%}')
+                if offset == 0:
+                    cv2.putText(panel, text, (2, _LINE - 3), cv2.FONT_HERSHEY_SIMPLEX, 0.33,
+                                (0, 0, 0), 1, cv2.LINE_AA)
+                    panel[_LINE:_LINE + 2] = panel[-2:] = (220, 38, 127)
+                row.append(panel)
+        rows.append(np.concatenate(row, 1))
+    return np.concatenate(rows)

@@ -1,0 +1,276 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Labels: the moments that a few marks name, found in every demonstration of a data set.
+
+Each named mark gets a softmax over the frames of a demonstration, of a linear function of what the
+pictures show around a frame. The marks of a demonstration are decoded together: they come in their
+order, about as far apart as in the demonstrations that were marked.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from tap_ros.base.errors import ConfigError
+from tap_ros.training.preference import describe, FEATURES, LEAST_FRAMES
+
+if TYPE_CHECKING:
+    from tap_ros.recording.cache import EpisodeStore
+
+RATE = 10.0  # Hz, at most, of the frames that may be labels
+MOTION_RATE = 5.0  # Hz, about, of the frames between which motion is described
+AROUND_S = (-0.6, -0.3, 0.0, 0.3, 0.6)  # of the frames that are described together
+GREY = (0.0, 0.1, 0.3, 1.0)  # weights of the small grey picture that are tried
+RIDGE = 0.2  # price of the squared weights, in nats; features have variance 1
+SPREAD_S = 0.1  # a mark is off by so much as often as not
+TOLERANCE_S = 0.3  # within which a label is held to be right
+LEAST_GAP_S = 0.4  # the least deviation of the time between two marks
+
+
+@dataclass(frozen=True)
+class Film:
+    """
+    What the pictures of a demonstration show around each of its frames, at RATE at most.
+
+    :param stamps: (T,) s.
+    :param features: (T, D) float64: FEATURES at the times AROUND_S, then the small grey picture.
+    :param index: (T,) which frames of the episode these are.
+    """
+
+    stamps: np.ndarray
+    features: np.ndarray
+    index: np.ndarray
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.stamps)
+
+    @property
+    def slowest(self) -> int:
+        """Return the frame between the first and the last one in which least moves."""
+        speed = self.features[:, len(FEATURES) * (len(AROUND_S) // 2) + FEATURES.index('speed')]
+        return 1 + int(speed[1:-1].argmin())
+
+    def near(self, second: float, within_s: float) -> float:
+        """Return which share of the frames between the ends is near to a time."""
+        return float((np.abs(self.stamps[1:-1] - second) <= within_s + 1e-6).mean())
+
+    def nearest(self, second: float) -> int:
+        """Return the frame nearest to a time, between the first and the last one."""
+        return int(np.clip(np.abs(self.stamps - second).argmin(), 1, len(self) - 2))
+
+
+def film_of(store: 'EpisodeStore', i: int) -> Film | None:
+    """Describe a demonstration of a store; None for one that is too short."""
+    if store.lengths[i] < LEAST_FRAMES:
+        return None
+    return film(store.frames(i), store[i].stamps)
+
+
+def film(frames: np.ndarray, stamps_ns: np.ndarray, hidden: np.ndarray | None = None) -> Film:
+    """
+    Describe the frames of a demonstration.
+
+    :param frames: (T, H, W, 3) uint8, at least LEAST_FRAMES.
+    :param stamps_ns: (T,) ns, rising.
+    :param hidden: (T, H, W) bool, pixels that do not count, such as the robot's.
+    :raises ConfigError: for fewer frames.
+    """
+    step = _every(stamps_ns, RATE)
+    index = np.arange(0, len(frames), step)
+    if len(index) < LEAST_FRAMES:
+        index = np.arange(len(frames))
+    stamps = (stamps_ns[index] - stamps_ns[0]) / 1e9
+    pictures, covered = frames[index], None if hidden is None else hidden[index]
+    # Motion between frames that are close is noise: every second, third... frame has its own.
+    step = min(_every(stamps_ns[index], MOTION_RATE), max(1, len(index) // LEAST_FRAMES))
+    found = np.empty((len(index), len(FEATURES)))
+    phases = [describe(pictures[k::step], None if covered is None else covered[k::step])
+              for k in range(step)]
+    for column in range(len(FEATURES)):
+        found[:, column] = np.mean([
+            np.interp(np.arange(len(index)), np.arange(k, len(index), step), phase[:, column])
+            for k, phase in enumerate(phases)], 0)
+    near = np.abs(stamps[:, None, None] + np.array(AROUND_S)[:, None] - stamps).argmin(-1)
+    grey = np.empty((len(index), phases[0].shape[1] - len(FEATURES)))
+    for k, phase in enumerate(phases):
+        grey[k::step] = phase[:, len(FEATURES):]
+    return Film(stamps, np.concatenate([found[near].reshape(len(index), -1), grey], 1), index)
+
+
+@dataclass(frozen=True)
+class Labels:
+    """
+    The moments of the demonstrations of a data set.
+
+    :param names: of M marks, in their order.
+    :param moments: of each demonstration (M,) s from its first frame; NaN in those too short.
+    :param confidence: of each (M,), 0 to 1: how likely the moment is right within TOLERANCE_S; 1
+        of those that were marked.
+    :param log_likelihood: of each (M, T): log of the posterior of each frame of its Film.
+    """
+
+    names: tuple[str, ...]
+    moments: list[np.ndarray]
+    confidence: list[np.ndarray]
+    log_likelihood: list[np.ndarray]
+
+
+class MomentModel:
+    """
+    Finds the moments of marks in demonstrations.
+
+    :param films: that were marked.
+    :param moments: of each (M,) s.
+    :param grey: weight of the small grey picture.
+    :raises ConfigError: without marks, or where not all have as many.
+    """
+
+    def __init__(self, films: Sequence[Film], moments: Sequence[np.ndarray], grey: float) -> None:
+        if not films or len({len(one) for one in moments}) != 1 or not len(moments[0]):
+            raise ConfigError('marks: expected some demonstrations with the same marks each; mark '
+                              'ten')
+        everything = np.concatenate([one.features for one in films])
+        self._mean, self._scale = everything.mean(0), 1 / np.maximum(everything.std(0), 1e-6)
+        self._scale[len(FEATURES) * len(AROUND_S):] *= grey
+        inputs = [self._inputs(one) for one in films]
+        self._weights = np.stack([
+            _most_likely(inputs, [_spread(one, second[m]) for one, second in zip(films, moments)])
+            for m in range(len(moments[0]))], 1)
+        gaps = np.diff(np.stack(moments), axis=1)  # (N, M - 1) s
+        self._gap = gaps.mean(0)
+        wide = gaps.var(0, ddof=1) if len(gaps) > 1 else np.full(len(self._gap), math.inf)
+        self._gap_deviation = np.sqrt(wide * (1 + 1 / len(gaps)) + LEAST_GAP_S ** 2)
+
+    def log_posterior(self, one: Film) -> np.ndarray:
+        """Return log of the posterior of each mark and frame, (M, T), all marks in their order."""
+        z = (self._inputs(one) @ self._weights).T  # (M, T)
+        z[:, [0, -1]] = -np.inf  # start and goal are no moments between them
+        z -= _log_sum(z)[:, None]
+        if len(z) == 1:
+            return z
+        gap = one.stamps[None] - one.stamps[:, None]  # (T, T), later minus earlier
+        links = [np.where(gap > 0, -0.5 * ((gap - mean) / deviation) ** 2, -np.inf)
+                 for mean, deviation in zip(self._gap, self._gap_deviation)]
+        forward, backward = [z[0]], [np.zeros(len(one))]
+        for m, link in enumerate(links):
+            forward.append(z[m + 1] + _log_sum((forward[m][:, None] + link).T))
+        for m in range(len(links) - 1, -1, -1):
+            backward.append(_log_sum(links[m] + z[m + 1] + backward[-1]))
+        found = np.stack(forward) + np.stack(backward[::-1])
+        return found - _log_sum(found)[:, None]
+
+    def _inputs(self, one: Film) -> np.ndarray:
+        return (one.features - self._mean) * self._scale
+
+
+def moments_of(one: Film, log_posterior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the moments (M,) s that are right within TOLERANCE_S most likely, and how likely.
+
+    :param log_posterior: (M, T), as MomentModel returns it.
+    """
+    near = np.abs(one.stamps[:, None] - one.stamps) <= TOLERANCE_S + 1e-6
+    mass = np.exp(log_posterior) @ near
+    mass[:, [0, -1]] = 0
+    best = mass.argmax(1)
+    return one.stamps[best], mass[np.arange(len(best)), best].clip(0, 1)
+
+
+def choose_grey(films: Sequence[Film], moments: Sequence[np.ndarray]) -> float:
+    """
+    Return the weight of the grey picture with which marks are found best by the other ones.
+
+    How likely a mark is within TOLERANCE_S counts, in the mean of the logarithms.
+    """
+    def worth(grey: float) -> float:
+        found = 0.0
+        for one, marks, log_posterior in leave_one_out(films, moments, grey):
+            near = np.abs(one.stamps - marks[:, None]) <= TOLERANCE_S + 1e-6  # (M, T)
+            found += float(np.log((np.exp(log_posterior) * near).sum(1) + 1e-3).sum())
+        return found
+    return max(GREY, key=worth) if len(films) > 2 else GREY[1]
+
+
+def leave_one_out(films: Sequence[Film], moments: Sequence[np.ndarray],
+                  grey: float) -> list[tuple[Film, np.ndarray, np.ndarray]]:
+    """Return each Film, its marks (M,) s, and the log posterior that the others give it."""
+    return [(films[i], moments[i], MomentModel(
+        [*films[:i], *films[i + 1:]], [*moments[:i], *moments[i + 1:]], grey
+        ).log_posterior(films[i])) for i in range(len(films))]
+
+
+def label(films: Sequence[Film | None], marked: dict[int, np.ndarray],
+          names: Sequence[str]) -> Labels:
+    """
+    Find the moments of all demonstrations.
+
+    :param films: of each demonstration its Film; None of one that is too short.
+    :param marked: {demonstration: moments (M,) s}.
+    :param names: of the M marks.
+    :raises ConfigError: see MomentModel.
+    """
+    chosen = [film for i in marked if (film := films[i]) is not None]
+    given = list(marked.values())
+    model = MomentModel(chosen, given, choose_grey(chosen, given))
+    found = Labels(tuple(names), [], [], [])
+    for i, one in enumerate(films):
+        if one is None:
+            posterior = np.empty((len(names), 0))
+            moments = confidence = np.full(len(names), math.nan)
+        elif i in marked:
+            moments, confidence = marked[i], np.ones(len(names))
+            posterior = -np.abs(one.stamps - moments[:, None]) / SPREAD_S
+        else:
+            posterior = model.log_posterior(one)
+            moments, confidence = moments_of(one, posterior)
+        found.moments.append(moments)
+        found.confidence.append(confidence)
+        found.log_likelihood.append(posterior)
+    return found
+
+
+def _every(stamps_ns: np.ndarray, rate: float) -> int:
+    """Return which share of the frames comes at about this rate: each, each second..."""
+    seconds = (stamps_ns[-1] - stamps_ns[0]) / 1e9
+    return max(1, round((len(stamps_ns) - 1) / max(seconds, 1e-9) / rate)) if seconds > 0 else 1
+
+
+def _spread(one: Film, second: float) -> np.ndarray:
+    """Return the probability (T,) that a person means a frame by this mark."""
+    share = np.maximum(0, 1 - np.abs(one.stamps - one.stamps[one.nearest(second)])
+                       / (2 * SPREAD_S))
+    return share / share.sum()
+
+
+def _most_likely(inputs: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> np.ndarray:
+    """
+    Return the weights a (D,) of the most likely softmax over frames, with a ridge.
+
+    Minimises sum_n -wanted_n . log softmax(x_n a) + RIDGE |a|^2, which is convex.
+
+    :param inputs: (T, D) each; wanted: (T,) each, adding up to 1.
+    """
+    from scipy.optimize import minimize  # takes a moment to import
+    target = sum(p @ x for x, p in zip(inputs, wanted))
+
+    def loss(a: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = RIDGE * a @ a - target @ a, 2 * RIDGE * a - target
+        for x in inputs:
+            z = x @ a
+            total = _log_sum(z)
+            value, slope = value + total, slope + np.exp(z - total) @ x
+        return float(value), slope
+
+    return np.asarray(minimize(loss, np.zeros(inputs[0].shape[1]), jac=True, method='L-BFGS-B',
+                               options={'maxiter': 300}).x)
+
+
+def _log_sum(z: np.ndarray) -> np.ndarray:
+    """Return log sum exp over the last axis; -inf of nothing."""
+    largest = np.maximum(z.max(-1), -1e300)
+    with np.errstate(divide='ignore'):
+        return np.asarray(largest + np.log(np.exp(z - largest[..., None]).sum(-1)))
