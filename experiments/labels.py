@@ -21,11 +21,12 @@ class Options:
     """
     Options of `python -m experiments labels`.
 
-    Prints, for each name, the share of demonstrations labelled within .3, .5 and 1 s, in the mean
-    of the draws; each demonstration that is not marked counts.
+    It prints, for each name, the share of demonstrations labelled within .3, .5 and 1 s, in the
+    mean of the draws; each demonstration that is not marked counts.
 
     :param recordings: one bag folder with all demonstrations.
     :param truth: JSON file {episode: {"grasp_s": 2.6, ...}}, s from the start of each episode.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param marks: demonstrations that are marked in each draw.
     :param draws: how many; draw k has the seed k.
     :param out: folder for labels.json with the errors; '': none is written.
