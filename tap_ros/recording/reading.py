@@ -21,8 +21,9 @@ class Reading:
 
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
         Of several topics each gives episodes of its own.
-    :param crop: the square part of the pictures that is used: 'centre', the largest one in the
-        middle, or LEFT,TOP,SIDE in pixels of the camera. Without it pictures are used whole.
+    :param crop: the part of the pictures that is used: 'centre', the largest square in the middle,
+        LEFT,TOP,SIDE, a square in pixels of the camera, or 'whole', which --size squeezes into a
+        square. Without it pictures are used whole, and have to be square to be scaled.
     :param size: pixels a side that pictures are scaled to, such as 64; 0: not scaled.
     :param rate: pictures a second, about; 0: all of them.
     :param gap: s; where no marks tell episodes apart, a longer pause between two pictures does;

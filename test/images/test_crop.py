@@ -11,18 +11,21 @@ from tap_ros.base.errors import ImageError
 from tap_ros.images.crop import Crop, trained_crop, TrainedCrop
 
 
-@given(st.integers(60, 200), st.integers(60, 200), st.sampled_from(['centre', '7,3,50', '0,0,60']),
+@given(st.integers(60, 200), st.integers(60, 200), st.sampled_from(
+    ['centre', '7,3,50', '0,0,60', 'whole']),
        st.sampled_from([0, 16, 64, 100]), st.randoms(use_true_random=False))
 def test_a_dot_and_its_position_move_together(height, width, part, size, random):
     crop = Crop(part, size)
-    left, top, side, _ = crop.window((height, width))
-    reach = max(side / (size or side), 1) + 3  # so that the scaled dot is inside
-    u, v = (random.uniform(low + reach, low + side - 1 - reach) for low in (left, top))
+    left, top, *sides = crop.window((height, width))
+    reach = max(max(sides) / (size or min(sides)), 1) + 3  # so that the scaled dot is inside
+    u, v = (random.uniform(low + reach, low + side - 1 - reach)
+            for low, side in zip((left, top), sides))
     y, x = np.mgrid[:height, :width]
     blob = np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * (reach / 3) ** 2))
     picture = np.repeat((255 * blob)[..., None], 3, -1).astype(np.uint8)
     cut = crop.image(picture)
-    assert cut.shape[:2] == crop.cut_size((height, width)) == ((size or side,) * 2)
+    assert cut.shape[:2] == crop.cut_size((height, width)) == (
+        (size, size) if size else tuple(sides[::-1]))
     y, x = np.mgrid[:cut.shape[0], :cut.shape[1]]
     weight = cut[..., 0] / cut[..., 0].sum()
     expected = crop.pixels(np.array([[u, v]], np.float32), (height, width))[0]
