@@ -22,13 +22,14 @@ import time
 
 import cv2
 import numpy as np
+from tap_ros.base.contract import LOST, SEEN
 from tap_ros.base.errors import TrackingError
 from tap_ros.evaluation.intervals import bootstrap, share_interval
 from tap_ros.images.drawing import film_strip, grid, OBJECT_COLOURS
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats.pictures import make_episode, video_frames
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.tracking.protocols import LOST, SEEN, Tracked, View
+from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.rigid_tracker import RigidTracker
 
 SIDE = 64  # errors are in pixels of a picture so many pixels wide

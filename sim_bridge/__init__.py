@@ -2,17 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated world of tap_ros."""
 
-import os
+import tap_ros.base  # noqa: F401  its handler of Ctrl-C, before what takes long to import
 
-import tap_ros  # noqa: F401  # its handler of Ctrl-C, before what takes long to import
-
-# Off-screen rendering on a machine without a display; MuJoCo reads it once, when it is imported.
-_chosen = os.environ['MUJOCO_GL'] = os.environ.get('MUJOCO_GL') or 'egl'
-GL_PROBLEM = ''  # why nothing can be drawn
-try:
-    import mujoco
-except Exception as error:  # no such value, or its library is not there; physics needs neither
-    GL_PROBLEM = str(error)
-    os.environ['MUJOCO_GL'] = 'disabled'
-    import mujoco  # noqa: F401
-    os.environ['MUJOCO_GL'] = _chosen
+# isort: split
+import sim_bridge.world.opengl  # noqa: F401  before anything imports MuJoCo

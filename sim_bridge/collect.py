@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from sim_bridge.tasks.tasks import get_task, TIMINGS
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
-from sim_bridge.world_protocol import ability, make_world, World
+from sim_bridge.world.protocol import ability, make_world, World
 from tap_ros.base.contract import TABLE
 from tap_ros.base.engines import Engine, LOCAL, run_tasks, Work
 from tap_ros.base.errors import check_fields, ConfigError, RecordingError

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from sim_bridge.world_protocol import Observation
+from sim_bridge.world.protocol import Observation
 from tap_ros.recording.episode import Episode
 
 MOST_FRAMES, LEAST_FRAMES = 70, 12

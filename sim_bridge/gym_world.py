@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.world.camera import OneCamera
-from sim_bridge.world_protocol import clip_action, Observation
+from sim_bridge.world.protocol import clip_action, Observation
 from tap_ros.base.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.base.errors import SceneError
 

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from sim_bridge.demonstrations import Demonstration, to_episode
 from sim_bridge.tasks.tasks import get_task, run_episode, sample_scene, task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, GRIP_SPREAD
+from sim_bridge.world.protocol import Observation
 from sim_bridge.world.table import lifted, Table
-from sim_bridge.world_protocol import Observation
 from tap_ros.base.errors import SceneError
 from tap_ros.base.text import listing
 from tap_ros.robots.arm import DEFAULT_ARM
@@ -21,7 +21,7 @@ class Simulator(Table):
     The World 'mujoco_table': an arm with a gripper, K objects, a camera, a goal.
 
     Everything follows from seeds and actions, to the bit. Observations have shapes and units as
-    world_protocol.Observation says; it belongs to the thread of its first reset, which draws.
+    protocol.Observation says; it belongs to the thread of its first reset, which draws.
 
     :param task: name of a task, such as 'push2'; see tasks.task_names.
     :param image_size: width and height of the pictures, 16 to 1024 pixels.

@@ -10,8 +10,8 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from sim_bridge.simulator import Simulator
+from sim_bridge.world.protocol import clip_moves
 from sim_bridge.world.table import objects_in, ramp_controls, SUBSTEPS
-from sim_bridge.world_protocol import clip_moves
 from tap_ros.base.errors import ConfigError
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.table import Table

@@ -12,13 +12,7 @@ import signal
 import sys
 
 from tap_ros.base.contract import NODE_CLASSES
-
-
-def leave_at_once(*_: object) -> None:
-    """Say so and end: the handler of SIGINT while a command or a node is imported."""
-    os.write(2, b'interrupted\n')
-    os._exit(130)
-
+from tap_ros.base.interrupts import leave_at_once
 
 # There an interrupt would come out as any error of what is imported. Commands and nodes handle it
 # themselves as soon as they run.
@@ -66,7 +60,7 @@ _EXPORTS = {
     'TapError': 'tap_ros.base.errors',
     'train': 'tap_ros.apps.train',
     'VisualMPC': 'tap_ros.planning.visual_mpc',
-    'World': 'sim_bridge.world_protocol',
+    'World': 'sim_bridge.world.protocol',
 }
 __all__ = list(_EXPORTS)
 

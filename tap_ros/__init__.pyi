@@ -3,7 +3,7 @@
 """The names of __all__ for type checkers, which cannot see what __init__.py exports lazily."""
 
 from sim_bridge.simulator import Simulator as Simulator
-from sim_bridge.world_protocol import World as World
+from sim_bridge.world.protocol import World as World
 from tap_ros.apps.train import train as train
 from tap_ros.base.errors import TapError as TapError
 from tap_ros.planning.protocols import ForwardModel as ForwardModel
@@ -16,5 +16,3 @@ from tap_ros.recording.reader import iter_episodes as iter_episodes
 from tap_ros.recording.writer import EpisodeWriter as EpisodeWriter
 from tap_ros.robots.arm import Arm as Arm
 from tap_ros.ros.client import Client as Client
-
-def leave_at_once(*_: object) -> None: ...

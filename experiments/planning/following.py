@@ -8,11 +8,12 @@ from functools import lru_cache
 import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.looks import LOOKS
+from tap_ros.base.contract import LOST
 from tap_ros.base.errors import TrackingError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.images.robot_mask import nearest_free
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.tracking.protocols import LOST, View
+from tap_ros.tracking.protocols import View
 
 CAMERA_SIZE = 256  # px, what objects are followed in
 CLICK_ERROR = 1.35  # px of 64, mean distance of a click from the middle of an object

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from sim_bridge.world_protocol import ability, Observation, World
+from sim_bridge.world.protocol import ability, Observation, World
 from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates
 from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 from sim_bridge.ros.publishers import ScenePublishers
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
-from sim_bridge.world_protocol import ability, make_world, Observation, World
+from sim_bridge.world.protocol import ability, make_world, Observation, World
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode

@@ -23,6 +23,7 @@ import numpy as np
 from sim_bridge.tasks.motions import carry_out, direction, EpisodeRun, moves, straight
 from sim_bridge.tasks.tasks import DemonstrationOptions, Task, TaskScene
 from sim_bridge.world.looks import GRIP_SPREAD
+from sim_bridge.world.protocol import Observation
 from sim_bridge.world.scene import (
     FINGER_GAP,
     FINGER_TRAVEL,
@@ -31,7 +32,6 @@ from sim_bridge.world.scene import (
     random_shape,
 )
 from sim_bridge.world.table import GRIPPER_HEIGHT, objects_in, ramp_controls, Table, upright
-from sim_bridge.world_protocol import Observation
 from tap_ros.base.contract import (
     CLEAR,
     MOVE_LIMIT,

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from sim_bridge.world.protocol import Observation
 from sim_bridge.world.table import objects_in, ramp_controls, SUBSTEPS, Table, upright
-from sim_bridge.world_protocol import Observation
 from tap_ros.base.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
 
 UPRIGHT = 0.9  # cosine, an object that is tilted more than this is about to topple

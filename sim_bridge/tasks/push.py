@@ -34,9 +34,9 @@ from sim_bridge.tasks.motions import (
     push_actions,
 )
 from sim_bridge.tasks.tasks import apart, DemonstrationOptions, Task, TaskScene
+from sim_bridge.world.protocol import Observation
 from sim_bridge.world.scene import random_shape
 from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE, lifted, Table
-from sim_bridge.world_protocol import Observation
 from tap_ros.base.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.base.search import cross_entropy
 

@@ -16,9 +16,9 @@ import numpy as np
 from sim_bridge.tasks.grasp import GRASP_HEIGHT, GRASP_YAW, GraspConfig, GraspExpert
 from sim_bridge.tasks.motions import carry_out, EpisodeRun, moves, straight
 from sim_bridge.tasks.tasks import apart, DemonstrationOptions, Task, TaskScene
+from sim_bridge.world.protocol import Observation
 from sim_bridge.world.scene import HALF_HEIGHT, ObjectShape
 from sim_bridge.world.table import GRIPPER_HEIGHT, Table
-from sim_bridge.world_protocol import Observation
 from tap_ros.base.contract import CLEAR
 
 BLOCK_HALF_WIDTH = (0.026, 0.032)  # m

@@ -13,9 +13,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from sim_bridge.tasks.motions import EpisodeRun
+from sim_bridge.world.protocol import Observation
 from sim_bridge.world.scene import ObjectShape
 from sim_bridge.world.table import Table
-from sim_bridge.world_protocol import Observation
 from tap_ros.base.contract import SUCCESS_DISTANCE, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.base.errors import ConfigError, SceneError
 from tap_ros.base.plugins import load_plugin, names

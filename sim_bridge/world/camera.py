@@ -11,7 +11,7 @@ import warnings
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge import GL_PROBLEM
+from sim_bridge.world.opengl import GL_PROBLEM
 from sim_bridge.world.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.base.errors import SceneError
 from tap_ros.base.text import escaped
@@ -91,7 +91,7 @@ class Camera:
 
 
 class OneCamera:
-    """A world whose pictures one camera takes, as world_protocol.World tells of it."""
+    """A world whose pictures one camera takes, as protocol.World tells of it."""
 
     camera: Camera
 

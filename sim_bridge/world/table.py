@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.world.camera import OneCamera
 from sim_bridge.world.looks import choose_appearance, DEFAULT_LOOK, get_look, USUAL
+from sim_bridge.world.protocol import clip_action, Observation
 from sim_bridge.world.scene import (
     build_scene,
     FINGER_TRAVEL,
@@ -22,7 +23,6 @@ from sim_bridge.world.scene import (
     TIMESTEP,
 )
 from sim_bridge.world.studio import Studio
-from sim_bridge.world_protocol import clip_action, Observation
 from tap_ros.base.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.base.errors import KinematicsError, SceneError
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm

@@ -18,8 +18,8 @@ import sys
 from typing import Annotated, Any, NamedTuple, TypeAlias
 import warnings
 
-from tap_ros import leave_at_once
 from tap_ros.base.errors import TapError
+from tap_ros.base.interrupts import leave_at_once
 from tap_ros.base.options import parse
 from tap_ros.base.text import escaped
 from tyro import conf

@@ -61,3 +61,4 @@ NODE_CLASSES = {
 def step_budget(num_objects: int) -> int:
     """Return B of App. F, how many commands a goal may take, by the number of its objects."""
     return 40 if num_objects <= 2 else 75
+STATES = SEEN, HIDDEN, UNSURE, LOST = 'seen', 'hidden', 'unsure', 'lost'  # of ObjectStates

@@ -74,3 +74,7 @@ def check_fields(config: Any, ranges: Mapping[str, tuple[float, float]]) -> None
         if wanted:
             raise ConfigError(
                 f'{field.name}: expected {wanted}, got {escaped(repr(value), 60)}')
+
+
+class RecordingWarning(UserWarning):
+    """A recording is damaged, but part of it could be read."""

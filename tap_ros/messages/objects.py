@@ -6,12 +6,12 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from tap_ros.base.contract import LOST, STATES
 from tap_ros.base.errors import PlanningError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.images.pixels import in_picture
 from tap_ros.messages.stamps import header_fields, Stamp
-from tap_ros.tracking.protocols import LOST, STATES
 
 MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is predicted
 MAX_NAME = 100  # characters

@@ -20,12 +20,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from tap_ros.base.contract import GOAL_TOLERANCE, step_budget
+from tap_ros.base.contract import GOAL_TOLERANCE, LOST, step_budget, UNSURE
 from tap_ros.base.text import listing
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.hierarchy import Itinerary, Target
 from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
-from tap_ros.tracking.protocols import LOST, UNSURE
 
 MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
 MOST_UNSURE = 3  # pictures in a row in which an object is not known for sure; likewise
@@ -47,7 +46,7 @@ class Observation:
     received: float = 0.0
     scene_ns: int = 0  # stamp at which the newest scene known of began; 0: nothing is known
     jumps: int = 0  # how often the clock of the stamps has jumped so far
-    states: tuple[str, ...] = ()  # K of tracking.protocols.STATES; none: all are seen
+    states: tuple[str, ...] = ()  # K of base.contract.STATES; none: all are seen
 
 
 @dataclass(frozen=True)

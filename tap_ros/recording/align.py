@@ -13,11 +13,12 @@ from dataclasses import replace
 import warnings
 
 import numpy as np
+from tap_ros.base.errors import RecordingWarning
 from tap_ros.messages.joints import contradicted, PLACE, positions_at
 from tap_ros.messages.stamps import MAX_GAP
 from tap_ros.recording.columns import Columns, NAMES, Track
 from tap_ros.recording.defects import FAR, seconds
-from tap_ros.recording.episode import EpisodeTable, RecordingWarning
+from tap_ros.recording.episode import EpisodeTable
 from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, Span

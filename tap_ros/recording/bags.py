@@ -13,10 +13,9 @@ from typing import Any, TypeAlias
 import warnings
 
 from mcap.writer import MCAP0_MAGIC as MAGIC
-from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.errors import ConfigError, RecordingError, RecordingWarning
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import CENTRE, TrainedCrop
-from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number, natural
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.sqlite_file import beginning, SQLITE

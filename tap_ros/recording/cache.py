@@ -30,13 +30,19 @@ import numpy as np
 from safetensors import safe_open, SafetensorError
 from safetensors.numpy import save_file
 from tap_ros.base.engines import run_tasks, Work
-from tap_ros.base.errors import ConfigError, EngineError, ImageError, RecordingError
+from tap_ros.base.errors import (
+    ConfigError,
+    EngineError,
+    ImageError,
+    RecordingError,
+    RecordingWarning,
+)
 from tap_ros.base.text import escaped
 from tap_ros.images.crop import CENTRE, check_trainable
 from tap_ros.recording.align import assemble, runs_of
 from tap_ros.recording.bags import find_bags, Paths
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
-from tap_ros.recording.episode import Episode, EpisodeTable, RecordingWarning
+from tap_ros.recording.episode import Episode, EpisodeTable
 from tap_ros.recording.mcap_file import bytes_of, McapFile
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading

@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 OUTCOMES = ('success', 'failure', 'interrupted', '')
 
 
-class RecordingWarning(UserWarning):
-    """A recording is damaged, but part of it could be read."""
-
-
 @dataclass(frozen=True)
 class Episode:
     """What was seen and done between the start and the end of one episode."""

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 import warnings
 
 import numpy as np
+from tap_ros.base.errors import RecordingWarning
 from tap_ros.recording.columns import Mark, Track
 from tap_ros.recording.defects import FAR
-from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.reading import Reading
 
 MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow

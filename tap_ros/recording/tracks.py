@@ -15,11 +15,11 @@ from dataclasses import replace
 import warnings
 
 import numpy as np
+from tap_ros.base.errors import RecordingWarning
 from tap_ros.base.text import escaped
 from tap_ros.messages.stamps import PROOF
 from tap_ros.recording.columns import Columns, Mark, NAMES, Track, WIDTHS
 from tap_ros.recording.defects import FAR
-from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import find_rounds, read_spans, Span
 

@@ -255,8 +255,11 @@ class Reaching:
             while time.monotonic() < deadline and not self.is_cancelled():
                 time.sleep(POLL_S)
             if time.monotonic() >= deadline:
-                raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; '
-                                + (server.silence or f'{server.name} may be busy or stopped'))
+                count = len(processes(self._goals.node.get_publishers_info_by_topic(
+                    self._goals.node.resolve_topic_name(STATUS))))
+                raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; ' + (
+                    f'{count} nodes serve it, leave one' if count > 1 else
+                    server.silence or f'{server.name} may be busy or stopped'))
             self._goals.renew()
             self._wait_for_planner(deadline, accept_s)
             self._id, self._sent_anew = self._goals.new_id(), True

@@ -8,8 +8,6 @@ from typing import Protocol
 
 import numpy as np
 
-STATES = SEEN, HIDDEN, UNSURE, LOST = 'seen', 'hidden', 'unsure', 'lost'  # of ObjectStates
-
 
 @dataclass(frozen=True)
 class View:

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from tap_ros.base.contract import LOST, SEEN
 from tap_ros.tracking.picture import Palette, Picture
 from tap_ros.tracking.plane import EDGE, Plane
-from tap_ros.tracking.protocols import LOST, SEEN, Tracked, View
+from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.silhouette import centre, silhouette
 from tap_ros.tracking.template import Matcher, Pose, Template
 

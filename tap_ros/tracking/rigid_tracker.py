@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from tap_ros.base.contract import HIDDEN, LOST, SEEN, UNSURE
 from tap_ros.base.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane, TOP
-from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
+from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.registration import locate, mean_shift, register
 from tap_ros.tracking.silhouette import clicked, middle, RADIUS, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template

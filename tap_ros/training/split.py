@@ -9,10 +9,9 @@ import warnings
 import zlib
 
 import numpy as np
-from tap_ros.base.errors import RecordingError
+from tap_ros.base.errors import RecordingError, RecordingWarning
 from tap_ros.images.robot_mask import RobotMask
 from tap_ros.messages.topics import ROBOT_MASK
-from tap_ros.recording.episode import RecordingWarning
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore

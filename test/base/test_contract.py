@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode
+from sim_bridge.world.protocol import clip_action
 from sim_bridge.world.scene import HALF_HEIGHT
 from sim_bridge.world.table import ramp_controls
-from sim_bridge.world_protocol import clip_action
 from tap_ros.base import contract
 from tap_ros.planning.action_sequences import Limits, SequenceShape
 from tap_ros.planning.forward_model import LearnedForwardModel

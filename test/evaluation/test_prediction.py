@@ -14,7 +14,7 @@ from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.apps.evaluate_prediction import Options, run
-from tap_ros.base.errors import ConfigError, ImageError
+from tap_ros.base.errors import ConfigError, ImageError, RecordingWarning
 from tap_ros.base.options import parse
 from tap_ros.evaluation.bottleneck import bottleneck_scores
 from tap_ros.evaluation.intervals import bootstrap
@@ -24,7 +24,6 @@ from tap_ros.images.pixels import to_float
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.marks import write_marks
 from tap_ros.weights.weights import save_weights
 import torch

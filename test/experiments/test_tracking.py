@@ -8,10 +8,11 @@ from experiments.tracks import fit_camera, follow, recoveries, summarise
 import numpy as np
 import pytest
 from tap_ros.base import plugins
+from tap_ros.base.contract import LOST, SEEN
 from tap_ros.base.errors import TrackingError
 from tap_ros.recording.episode import Episode
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.tracking.protocols import LOST, SEEN, Tracked
+from tap_ros.tracking.protocols import Tracked
 
 T, SIZE = 12, 64
 

@@ -9,9 +9,8 @@ import sys
 
 from made_bags import camera, IMAGE, JOINTS, mark, read, record, shown, write_mcap
 import pytest
-from tap_ros.base.errors import RecordingError
+from tap_ros.base.errors import RecordingError, RecordingWarning
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import RecordingWarning
 import yaml
 import zstandard
 

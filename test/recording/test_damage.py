@@ -13,11 +13,10 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 import pytest
-from tap_ros.base.errors import RecordingError
+from tap_ros.base.errors import RecordingError, RecordingWarning
 from tap_ros.recording import mcap_file
 from tap_ros.recording import writer as writer_module
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.writer import EpisodeWriter, FileWriter
 import zstandard
 

@@ -11,7 +11,7 @@ from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from sim_bridge.demonstrations import demonstrate, find_bottleneck
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
-from sim_bridge.world_protocol import make_world
+from sim_bridge.world.protocol import make_world
 from tap_ros.base.engines import Engine
 from tap_ros.base.errors import SceneError, TapError
 from tap_ros.recording.cache import open_recordings

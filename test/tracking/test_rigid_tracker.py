@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.looks import LOOKS
+from tap_ros.base.contract import HIDDEN, LOST, SEEN, UNSURE
 from tap_ros.base.errors import TrackingError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.plane import check_pose, TOP
-from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, UNSURE, View
+from tap_ros.tracking.protocols import View
 from tap_ros.tracking.registration import propose
 
 SIZE = 256

@@ -8,7 +8,7 @@ from made_episodes import cover, make_episode, write_bag
 import numpy as np
 import pytest
 from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.base.errors import RecordingError
+from tap_ros.base.errors import RecordingError, RecordingWarning
 from tap_ros.images.robot_mask import (
     fill_from_past,
     fill_in_time,
@@ -16,7 +16,6 @@ from tap_ros.images.robot_mask import (
     hidden_pixels,
 )
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import RecordingWarning
 from tap_ros.training.frames import FilledStore, GOAL, ResidentFrames
 from tap_ros.training.split import with_masks
 

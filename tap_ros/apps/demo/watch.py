@@ -14,7 +14,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_ros.apps.demo.film import GOAL, Run
-from tap_ros.base.contract import SUCCESS_DISTANCE
+from tap_ros.base.contract import LOST, SUCCESS_DISTANCE
 from tap_ros.base.errors import TapError
 from tap_ros.images.robot_mask import nearest_free
 from tap_ros.messages.images import decode_image, decode_mask
@@ -26,7 +26,6 @@ from tap_ros.ros.client import Client
 from tap_ros.ros.reaching import ReachResult
 from tap_ros.ros.topics import LATCHED
 from tap_ros.ros.views import positions_of, View
-from tap_ros.tracking.protocols import LOST
 
 # Nothing is lost while this process, which also draws films, is held up.
 STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import SelectObjects
+from tap_ros.base.contract import SEEN
 from tap_ros.base.errors import TapError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.base.text import escaped, listing
@@ -26,7 +27,6 @@ from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.topics import encode_objects, LATCHED
-from tap_ros.tracking.protocols import SEEN
 
 SILENT_S = 2.0  # after which the page says that a topic is silent
 LARGEST = 640  # px; larger pictures are made smaller for the page

@@ -14,7 +14,7 @@ import numpy as np
 from rclpy.node import Node
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import SelectObjects
-from tap_ros.base.contract import WORLD_FRAME
+from tap_ros.base.contract import HIDDEN, LOST, SEEN, WORLD_FRAME
 from tap_ros.base.errors import TapError, TrackingError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.base.text import escaped, listing
@@ -30,7 +30,7 @@ from tap_ros.ros.parameters import CameraParameters, Parameters, setting
 from tap_ros.ros.subscriptions import Publishers, rivals
 from tap_ros.ros.topics import encode_objects, LATCHED, SERVICE_QOS, STREAM
 from tap_ros.tracking.plane import MIDDLE, Plane
-from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, Tracker, View
+from tap_ros.tracking.protocols import Tracked, Tracker, View
 from tap_ros.tracking.registration import propose
 
 MOVED = 2.0  # px of the working picture by which the table has moved in that of another camera

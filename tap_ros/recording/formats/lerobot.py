@@ -22,12 +22,12 @@ import warnings
 
 import numpy as np
 from tap_ros.base.contract import MAX_PICTURE_BYTES
-from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.errors import ConfigError, RecordingError, RecordingWarning
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
+from tap_ros.recording.episode import Episode, OUTCOMES
 from tap_ros.recording.formats.lerobot_format import (
     ACTION,
     INDICES,

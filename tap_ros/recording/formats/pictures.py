@@ -21,14 +21,14 @@ import warnings
 import cv2
 import numpy as np
 from tap_ros.base.contract import MAX_PICTURE_BYTES
-from tap_ros.base.errors import ConfigError, ImageError, RecordingError
+from tap_ros.base.errors import ConfigError, ImageError, RecordingError, RecordingWarning
 from tap_ros.base.files import only_writer
 from tap_ros.base.options import default_text, Folder
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.recording.bags import VIDEOS, what_else, what_is
 from tap_ros.recording.defects import Defect, describe
-from tap_ros.recording.episode import Episode, RecordingWarning
+from tap_ros.recording.episode import Episode
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading import Part
 from tap_ros.recording.trust import inside, MOST_BYTES, MOST_FRAMES, regular
