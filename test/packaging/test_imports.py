@@ -3,6 +3,7 @@
 """Who may import whom, and who may import ROS."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 import re
 import subprocess
@@ -107,6 +108,22 @@ def test_imports_come_only_from_above():
 def test_the_package_does_without_the_simulator():
     assert not [name for name, path in MODULES.items() if name.startswith('tap_ros')
                 and any(target.startswith('sim_bridge') for target in imported(path))]
+
+
+def module_of(name):
+    """Return the module that an imported name is, or is in."""
+    return name if name in MODULES else name.rpartition('.')[0]
+
+
+def test_there_is_no_circle_between_modules_or_folders():
+    modules = {name: {module_of(target) for target in imported(path)} & MODULES.keys() - {name}
+               for name, path in MODULES.items() if not name.startswith('experiments')}
+    folders = {}
+    for name, targets in modules.items():
+        folder, *others = (MODULES[each].parent for each in (name, *targets))
+        folders.setdefault(folder, set()).update(set(others) - {folder})
+    for graph in (modules, folders):
+        TopologicalSorter(graph).prepare()  # raises CycleError, which names it
 
 
 def test_without_ros_all_but_the_nodes_can_be_imported():
