@@ -17,14 +17,13 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage
-from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.stamps import PROOF, to_nanoseconds
 from tap_ros.ros.polling import PollOnlyGroup, take_messages
 from tap_ros.ros.subscriptions import ADAPT_PERIOD, adapt_regularly, AdaptiveSubscription
 
 DEPTH = 10  # stamps remembered
 JUMP_NS = 10 * 10**9  # a stamp that far ahead of all others is not believed at once
 REMEMBERED = 100  # messages of a latched topic by which repetitions are recognised
-PROOF = 3  # messages in a row that prove that the clock of a topic has jumped
 POLL_LIMIT = 100  # messages of a topic taken by one poll; the rest comes with the next
 POLL_S = 0.005  # between two polls while waiting
 CLOCK_S = 1.0  # s after which nothing is known of a clock or driver that is silent
