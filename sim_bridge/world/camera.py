@@ -156,7 +156,8 @@ class Renderer(mujoco.Renderer):  # type: ignore[misc]  # MuJoCo has no types
         try:
             super().close()
         except Exception:
-            _kept.append((self._mjr_context, self._gl_context))
+            # What failed while it was made has neither.
+            _kept.append([vars(self).get(name) for name in ('_mjr_context', '_gl_context')])
 
 
 _kept: list[object] = []  # freed with another context, they would take away its objects

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shells, containers and terminals as people have them: it works, or one line says why not."""
 
+from ctypes.util import find_library
 import os
 from pathlib import Path
 import signal
@@ -32,7 +33,9 @@ def test_the_environment_can_be_entered_by_any_shell(options):
     assert ('u' in done.stdout.split('left ')[1]) == ('u' in options and '+' not in options)
 
 
-def test_without_opengl_physics_runs_and_pictures_are_refused_in_one_line(value='disabled'):
+@pytest.mark.parametrize('value', ['disabled', pytest.param('osmesa', marks=pytest.mark.skipif(
+    find_library('OSMesa') is not None, reason='OSMesa is installed'))])
+def test_without_opengl_physics_runs_and_pictures_are_refused_in_one_line(value):
     done = run('import sim_bridge, mujoco\n'
                'mujoco.MjModel.from_xml_string("<mujoco/>")\n'
                'from tap_ros.base.errors import SceneError\n'
