@@ -84,6 +84,8 @@ def sim(tmp_path_factory):
 def scene(sim, client):
     """Return the scene, beside a tracker."""
     scene, node = Scene(client), LocalNode(TrackerNode)
+    inputs = node.node._inputs  # without the camera's pose objects have no positions
+    assert until(lambda: inputs.info is not None and inputs.pose is not None)
     yield scene
     assert node.end() == 0
 
