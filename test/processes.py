@@ -259,6 +259,7 @@ class LocalNode:
         self.heartbeat.end()
         self.executor.shutdown(timeout_sec=2.0)
         self.node.destroy_node()
+        vars(self.node).pop('_state_machine', None)  # rclpy's: it keeps the node in the ROS graph
         self.context.try_shutdown()
         return code or 0
 

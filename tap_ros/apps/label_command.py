@@ -8,27 +8,20 @@ from dataclasses import dataclass
 import io
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
-from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File, Folder, Topic
+from tap_ros.base.text import listing
+from tap_ros.evaluation.intervals import share_interval
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
-from tap_ros.recording.formats.lerobot_subtasks import segment_names, write_subtasks
+from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
 from tap_ros.recording.marks import beside, numbered, read_marks
 from tap_ros.recording.reading import Reading
-from tap_ros.training.labels import (
-    choose_grey,
-    Film,
-    film_of,
-    label,
-    Labels,
-    leave_one_out,
-    moments_of,
-)
+from tap_ros.training.labels import film_of, label, Labels
 from tqdm import tqdm
 from tyro import conf
 
@@ -73,11 +66,8 @@ def run(options: Options) -> None:
     marks = read_marks(path, store)
     marked = {i: np.array([seconds_of(store, i, (first + last) // 2) for first, last in those])
               for i, those in marks.episodes.items()}
-    counts = {len(one) for one in marked.values()}
-    if len(counts) != 1:
-        raise ConfigError(f'{path}: expected as many marks in each demonstration, got from '
-                          f'{min(counts)} to {max(counts)}')
-    names = marks.names or tuple(f'mark {k + 1}' for k in range(counts.pop()))
+    names = marks.names or tuple(
+        f'mark {k + 1}' for k in range(len(next(iter(marked.values()), ()))))
     films = [film_of(store, i) for i in tqdm(
         range(len(store)), desc='describing', unit='demonstration', delay=1)]
     labels = label(films, marked, names)
@@ -94,14 +84,13 @@ def run(options: Options) -> None:
         'names': names, 'marks': marks.digest, 'labels': rows}, indent=1) + '\n')
     write_atomically(out / 'labels.csv', to_csv(rows))
     write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
+    print(worth([(films[i], marked[i]) for i in marked], labels))
     if options.write_lerobot:
-        names_of_parts = segment_names(names)
-        rows_written = write_subtasks(options.write_lerobot, names_of_parts, {
-            i: moments.tolist() for i, moments in enumerate(labels.moments)
-            if films[i] is not None})
-        print(f'{options.write_lerobot}: {rows_written} rows with the subtasks '
-              f'{", ".join(names_of_parts)}')
-    print(worth([(film, marked[i]) for i in marked if (film := films[i]) is not None], names))
+        parts = segment_names(names)
+        count = write_subtasks(options.write_lerobot, parts, {
+            i: Ends(moments.tolist(), seconds_of(store, i, -1))
+            for i, moments in enumerate(labels.moments)})
+        print(f'{options.write_lerobot}: {count} rows with the subtasks {listing(parts)}')
     print(f'{out}: {len(store)} demonstrations labelled; look at labels.png: numbers cannot tell '
           'whether all marks are early or late')
 
@@ -121,42 +110,34 @@ def to_csv(rows: Sequence[dict[str, object]]) -> str:
     return text.getvalue()
 
 
-def worth(marked: Sequence[tuple[Film, np.ndarray]], names: Sequence[str]) -> str:
+def worth(marked: Sequence[tuple[Any, np.ndarray]], labels: Labels) -> str:
     """
     Return in words how far off labels are, by leaving out each marked demonstration once.
 
     :param marked: Film and marks (M,) s of each.
     """
-    from scipy.stats import binomtest  # takes a second to import
-    films, moments = map(list, zip(*marked))
-    if len(films) < 3:
-        return f'{len(films)} marked demonstrations do not tell how good labels are; mark ten'
-    found = leave_one_out(films, moments, choose_grey(films, moments))
-    lines = [f'Each of {len(films)} marked demonstrations, labelled by the others: share of labels'
-             f' within {", ".join(f"{s:g}" for s in WITHIN_S)} s (95%), median error']
-    for m, name in enumerate(names):
-        true = np.array([one[m] for one in moments])
-        ends = np.array([film.stamps[-1] for film in films])
-        shares = true / ends
-        guesses = {
-            'label': [moments_of(film, posterior)[0][m] for film, _, posterior in found],
-            'fixed share of the time': [
-                end * np.median(np.delete(shares, i)) for i, end in enumerate(ends)],
-            'slowest frame': [film.stamps[film.slowest] for film in films]}
-        random = float(np.mean([film.near(second, WITHIN_S[1])
-                                for film, second in zip(films, true)]))
-        told = True
-        for way, guess in guesses.items():
+    if not labels.left_out:
+        return f'{len(marked)} marked demonstrations do not tell how good labels are; mark ten'
+    lines = [f'Each of {len(marked)} marked demonstrations, labelled by the others: share of '
+             f'labels within {", ".join(f"{s:g}" for s in WITHIN_S)} s (95%), median error']
+    ends = np.array([film.stamps[-1] for film, _ in marked])
+    for m, name in enumerate(labels.names):
+        true = np.array([moments[m] for _, moments in marked])
+        random = float(np.mean([film.near(moments[m], WITHIN_S[1]) for film, moments in marked]))
+        found = {}
+        for way, guess in {
+                'label': [moments[m] for moments in labels.left_out],
+                'fixed share of the time': [
+                    end * np.median(np.delete(true / ends, i)) for i, end in enumerate(ends)],
+                'slowest frame': [film.stamps[film.slowest] for film, _ in marked]}.items():
             errors = np.abs(np.array(guess) - true)
-            hits = [int((errors <= s + 1e-6).sum()) for s in WITHIN_S]
-            spans = [binomtest(k, len(errors)).proportion_ci(method='wilson') for k in hits]
-            told &= way != 'label' or spans[1].low > random
+            found[way] = [share_interval(errors <= s + 1e-6) for s in WITHIN_S]
             lines.append(f'  {name}, {way}: ' + ', '.join(
-                f'{k / len(errors):.0%} ({low:.0%} to {high:.0%})'
-                for k, (low, high) in zip(hits, spans)) + f'; {np.median(errors):.2f} s')
-        lines.append(f'  {name}, random frame: {random:.0%} within {WITHIN_S[1]:g} s'
-                     + ('' if told else '; labels are not told from chance: mark more '
-                        'demonstrations, or other moments'))
+                f'{one.value:.0%} ({one.low:.0%} to {one.high:.0%})' for one in found[way])
+                + f'; {np.median(errors):.2f} s')
+        lines.append(f'  {name}, random frame: {random:.0%} within {WITHIN_S[1]:g} s' + (
+            '' if found['label'][1].low > random else
+            '; labels are not told from chance: mark more demonstrations, or other moments'))
     return '\n'.join(lines)
 
 
@@ -166,7 +147,7 @@ def contact_sheet(store: EpisodeStore, labels: Labels, marked: set[int]) -> np.n
 
     :return: uint8 (height, width, 3) rgb.
     """
-    usable = [i for i in range(len(store)) if len(labels.log_likelihood[i][0])]
+    usable = [i for i in range(len(store)) if np.isfinite(labels.moments[i]).all()]
     order = sorted(usable, key=lambda i: (i in marked, labels.confidence[i].min()))[:SHEET_ROWS]
     rows = []
     for i in order:

@@ -55,8 +55,10 @@ class Marking:
         self.store, self.path, self._recordings = store, path, recordings
         self._lock = threading.Lock()
         self._marks: dict[int, Sequence[Mark]] = {}
+        self._names: Sequence[str] = ()
         if path.exists():
-            self._marks = dict(read_marks(path, store).episodes)
+            known = read_marks(path, store)
+            self._marks, self._names = dict(known.episodes), known.names
         self._usable = [i for i in range(len(store)) if store.lengths[i] >= LEAST_FRAMES]
         if not self._usable:
             raise ConfigError(f'recordings: no episode has {LEAST_FRAMES} frames; record longer '
@@ -77,7 +79,7 @@ class Marking:
             marks = {i: those for i, those in self._marks.items() if i != episode}
             if frames:
                 marks[episode] = [(t, t) for t in sorted(set(frames))]
-            write_marks(self.path, self.store, self._recordings, marks)
+            write_marks(self.path, self.store, self._recordings, marks, self._names)
             self._marks = marks
 
     def state(self) -> dict[str, Any]:

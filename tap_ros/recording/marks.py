@@ -72,7 +72,8 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
         content = parse_json(data)
         entries, names = content['marks'], content.get('names', [])
         found = [(entry['recording'], entry['episode'], entry['stamps']) for entry in entries]
-        if not all(isinstance(name, str) and name for name in names):
+        if not isinstance(names, list) or not all(
+                isinstance(name, str) and name for name in names) or len({*names}) < len(names):
             raise TypeError
         if not all(isinstance(one[0], str) and isinstance(one[1], int) for one in found):
             raise TypeError
@@ -151,12 +152,12 @@ def numbered(store: 'EpisodeStore', recordings: Iterable[str | Path],
 
 
 def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[str | Path],
-                episodes: Mapping[int, Sequence[Mark]]) -> None:
+                episodes: Mapping[int, Sequence[Mark]], names: Sequence[str] = ()) -> None:
     """
     Write a file of marks in one step, a mark a line.
 
     :param recordings: paths of the store.
-    :param episodes: as in Marks.
+    :param episodes: as in Marks; names: likewise.
     :raises StorageError: when it cannot be written; an existing file is then what it was.
     """
     numbers = numbered(store, recordings, Path(path).resolve().parent)
@@ -166,4 +167,5 @@ def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[st
         recording, number = numbers[i]
         lines.append(json.dumps({'recording': recording, 'episode': number, 'stamps': [
             first if first == last else [first, last] for first, last in seconds]}))
-    write_atomically(path, '{"marks": [\n' + ',\n'.join(lines) + '\n]}\n')
+    named = f'"names": {json.dumps(list(names))}, ' if names else ''
+    write_atomically(path, f'{{{named}"marks": [\n' + ',\n'.join(lines) + '\n]}\n')

@@ -48,20 +48,12 @@ class Goals:
 
     def __init__(self, node: Node, server: Liveness, group: CallbackGroup,
                  answers: CallbackGroup) -> None:
-        self.node, self.server, self._group = node, server, group
-        self.renew()
+        self.node, self.server = node, server
+        self.action = ActionClient(node, ReachGoal, ACTION, callback_group=group)
         self.cancels = node.create_client(CancelGoal, CANCEL, callback_group=answers)
         self.open: set[Reaching] = set()  # that have not ended
         self.given_up, self.closed = threading.Event(), threading.Event()
         threading.Thread(target=self._cancel, name='cancelling', daemon=True).start()
-
-    def renew(self) -> None:
-        """
-        Send and hear by new endpoints: Fast DDS can fail to match one with a planner for good.
-
-        The node keeps the old ones, as its executor may be waiting for them.
-        """
-        self.action = ActionClient(self.node, ReachGoal, ACTION, callback_group=self._group)
 
     def new_id(self) -> Any:
         """Return the id of a goal; the planner watches whom its first bytes name."""
@@ -226,7 +218,11 @@ class Reaching:
     def _begin(self, goal: ReachGoal.Goal, accept_s: float) -> None:
         """Send the goal, and wait until it is accepted."""
         deadline = time.monotonic() + accept_s
-        self._wait_for_planner(deadline, accept_s)
+        while not self._goals.action.server_is_ready():
+            if time.monotonic() >= deadline:
+                raise CallError(f'{self._name}: nobody offers it after {accept_s:g} s; start '
+                                f'{self._server.name}')
+            time.sleep(POLL_S)
         self._presence = publishers_present(self._goals.node, STATUS)
         while not (accepted := self._sent(goal, deadline, accept_s)).accepted:
             if not self._sent_anew or time.monotonic() >= deadline:
@@ -260,16 +256,7 @@ class Reaching:
                 raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; ' + (
                     f'{count} nodes serve it, leave one' if count > 1 else
                     server.silence or f'{server.name} may be busy or stopped'))
-            self._goals.renew()
-            self._wait_for_planner(deadline, accept_s)
             self._id, self._sent_anew = self._goals.new_id(), True
-
-    def _wait_for_planner(self, deadline: float, accept_s: float) -> None:
-        while not self._goals.action.server_is_ready():
-            if time.monotonic() >= deadline:
-                raise CallError(f'{self._name}: nobody offers it after {accept_s:g} s; start '
-                                f'{self._server.name}')
-            time.sleep(POLL_S)
 
     def _send(self, goal: ReachGoal.Goal) -> Future:
         goal_id = self._id

@@ -8,13 +8,14 @@ pictures show around a frame. The marks of a demonstration are decoded together:
 order, about as far apart as in the demonstrations that were marked.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.base.errors import ConfigError
+from tap_ros.base.text import listing
 from tap_ros.training.preference import describe, FEATURES, LEAST_FRAMES
 
 if TYPE_CHECKING:
@@ -37,12 +38,10 @@ class Film:
 
     :param stamps: (T,) s.
     :param features: (T, D) float64: FEATURES at the times AROUND_S, then the small grey picture.
-    :param index: (T,) which frames of the episode these are.
     """
 
     stamps: np.ndarray
     features: np.ndarray
-    index: np.ndarray
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -65,18 +64,15 @@ class Film:
 
 def film_of(store: 'EpisodeStore', i: int) -> Film | None:
     """Describe a demonstration of a store; None for one that is too short."""
-    if store.lengths[i] < LEAST_FRAMES:
-        return None
-    return film(store.frames(i), store[i].stamps)
+    return None if store.lengths[i] < LEAST_FRAMES else film(store.frames(i), store[i].stamps)
 
 
-def film(frames: np.ndarray, stamps_ns: np.ndarray, hidden: np.ndarray | None = None) -> Film:
+def film(frames: np.ndarray, stamps_ns: np.ndarray) -> Film:
     """
     Describe the frames of a demonstration.
 
     :param frames: (T, H, W, 3) uint8, at least LEAST_FRAMES.
     :param stamps_ns: (T,) ns, rising.
-    :param hidden: (T, H, W) bool, pixels that do not count, such as the robot's.
     :raises ConfigError: for fewer frames.
     """
     step = _every(stamps_ns, RATE)
@@ -84,12 +80,11 @@ def film(frames: np.ndarray, stamps_ns: np.ndarray, hidden: np.ndarray | None = 
     if len(index) < LEAST_FRAMES:
         index = np.arange(len(frames))
     stamps = (stamps_ns[index] - stamps_ns[0]) / 1e9
-    pictures, covered = frames[index], None if hidden is None else hidden[index]
+    pictures = frames[index]
     # Motion between frames that are close is noise: every second, third... frame has its own.
     step = min(_every(stamps_ns[index], MOTION_RATE), max(1, len(index) // LEAST_FRAMES))
     found = np.empty((len(index), len(FEATURES)))
-    phases = [describe(pictures[k::step], None if covered is None else covered[k::step])
-              for k in range(step)]
+    phases = [describe(pictures[k::step]) for k in range(step)]
     for column in range(len(FEATURES)):
         found[:, column] = np.mean([
             np.interp(np.arange(len(index)), np.arange(k, len(index), step), phase[:, column])
@@ -98,7 +93,7 @@ def film(frames: np.ndarray, stamps_ns: np.ndarray, hidden: np.ndarray | None = 
     grey = np.empty((len(index), phases[0].shape[1] - len(FEATURES)))
     for k, phase in enumerate(phases):
         grey[k::step] = phase[:, len(FEATURES):]
-    return Film(stamps, np.concatenate([found[near].reshape(len(index), -1), grey], 1), index)
+    return Film(stamps, np.concatenate([found[near].reshape(len(index), -1), grey], 1))
 
 
 @dataclass(frozen=True)
@@ -110,13 +105,14 @@ class Labels:
     :param moments: of each demonstration (M,) s from its first frame; NaN in those too short.
     :param confidence: of each (M,), 0 to 1: how likely the moment is right within TOLERANCE_S; 1
         of those that were marked.
-    :param log_likelihood: of each (M, T): log of the posterior of each frame of its Film.
+    :param left_out: of each that was marked, in their order, what the others make of it: (M,) s;
+        none where fewer than three are marked.
     """
 
     names: tuple[str, ...]
     moments: list[np.ndarray]
     confidence: list[np.ndarray]
-    log_likelihood: list[np.ndarray]
+    left_out: list[np.ndarray]
 
 
 class MomentModel:
@@ -180,61 +176,59 @@ def moments_of(one: Film, log_posterior: np.ndarray) -> tuple[np.ndarray, np.nda
     return one.stamps[best], mass[np.arange(len(best)), best].clip(0, 1)
 
 
-def choose_grey(films: Sequence[Film], moments: Sequence[np.ndarray]) -> float:
-    """
-    Return the weight of the grey picture with which marks are found best by the other ones.
-
-    How likely a mark is within TOLERANCE_S counts, in the mean of the logarithms.
-    """
-    def worth(grey: float) -> float:
-        found = 0.0
-        for one, marks, log_posterior in leave_one_out(films, moments, grey):
-            near = np.abs(one.stamps - marks[:, None]) <= TOLERANCE_S + 1e-6  # (M, T)
-            found += float(np.log((np.exp(log_posterior) * near).sum(1) + 1e-3).sum())
-        return found
-    return max(GREY, key=worth) if len(films) > 2 else GREY[1]
-
-
 def leave_one_out(films: Sequence[Film], moments: Sequence[np.ndarray],
-                  grey: float) -> list[tuple[Film, np.ndarray, np.ndarray]]:
-    """Return each Film, its marks (M,) s, and the log posterior that the others give it."""
-    return [(films[i], moments[i], MomentModel(
-        [*films[:i], *films[i + 1:]], [*moments[:i], *moments[i + 1:]], grey
-        ).log_posterior(films[i])) for i in range(len(films))]
+                  grey: float) -> tuple[float, list[np.ndarray]]:
+    """
+    Find the marks of each demonstration by those of the others.
+
+    :return: how likely they are right within TOLERANCE_S, the sum of logarithms; and the moments.
+    """
+    worth, found = 0.0, []
+    for i, (one, marks) in enumerate(zip(films, moments)):
+        posterior = MomentModel([*films[:i], *films[i + 1:]], [*moments[:i], *moments[i + 1:]],
+                                grey).log_posterior(one)
+        near = np.abs(one.stamps - marks[:, None]) <= TOLERANCE_S + 1e-6  # (M, T)
+        worth += float(np.log((np.exp(posterior) * near).sum(1) + 1e-3).sum())
+        found.append(moments_of(one, posterior)[0])
+    return worth, found
 
 
-def label(films: Sequence[Film | None], marked: dict[int, np.ndarray],
+def label(films: Sequence[Film | None], marked: Mapping[int, np.ndarray],
           names: Sequence[str]) -> Labels:
     """
     Find the moments of all demonstrations.
 
-    :param films: of each demonstration its Film; None of one that is too short.
+    The grey picture gets the weight with which the marks are found best by one another.
+
+    :param films: of each demonstration its Film; None of one that is too short to be marked.
     :param marked: {demonstration: moments (M,) s}.
     :param names: of the M marks.
-    :raises ConfigError: see MomentModel.
+    :raises ConfigError: see MomentModel; for as many names as there are not marks.
     """
-    chosen = [film for i in marked if (film := films[i]) is not None]
-    given = list(marked.values())
-    model = MomentModel(chosen, given, choose_grey(chosen, given))
-    found = Labels(tuple(names), [], [], [])
+    chosen, given = [film for i in marked if (film := films[i])], list(marked.values())
+    if any(len(moments) != len(names) for moments in given):
+        raise ConfigError(f'marks: expected {len(names)} in each demonstration, '
+                          f'{listing(names)}, got {sorted({*map(len, given)})}')
+    grey, left_out = GREY[1], []
+    if len(chosen) > 2:
+        tried = {grey: leave_one_out(chosen, given, grey) for grey in GREY}
+        grey = max(GREY, key=lambda grey: tried[grey][0])
+        left_out = tried[grey][1]
+    model = MomentModel(chosen, given, grey)
+    found = Labels(tuple(names), [], [], left_out)
     for i, one in enumerate(films):
-        if one is None:
-            posterior = np.empty((len(names), 0))
-            moments = confidence = np.full(len(names), math.nan)
-        elif i in marked:
+        moments, confidence = np.full((2, len(names)), math.nan)
+        if i in marked:
             moments, confidence = marked[i], np.ones(len(names))
-            posterior = -np.abs(one.stamps - moments[:, None]) / SPREAD_S
-        else:
-            posterior = model.log_posterior(one)
-            moments, confidence = moments_of(one, posterior)
+        elif one is not None:
+            moments, confidence = moments_of(one, model.log_posterior(one))
         found.moments.append(moments)
         found.confidence.append(confidence)
-        found.log_likelihood.append(posterior)
     return found
 
 
 def _every(stamps_ns: np.ndarray, rate: float) -> int:
-    """Return which share of the frames comes at about this rate: each, each second..."""
+    """Return the stride with which frames come at about this rate."""
     seconds = (stamps_ns[-1] - stamps_ns[0]) / 1e9
     return max(1, round((len(stamps_ns) - 1) / max(seconds, 1e-9) / rate)) if seconds > 0 else 1
 

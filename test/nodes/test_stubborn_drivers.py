@@ -15,7 +15,6 @@ from tap_ros.planning.reach import MOST_REFUSED
 from tap_ros.planning.visual_mpc import Scene
 
 pytestmark = pytest.mark.slow
-SPACE = '/stubborn'
 
 
 class Rig:
@@ -28,7 +27,7 @@ class Rig:
     def __init__(self, node, world):
         self.world, self.arm, self.threads = world, Arm(node), set()
         self.client = tap_ros.Client(node=node)
-        self.planner = LocalNode(VisualMpcNode, SPACE, num_threads=4)
+        self.planner = LocalNode(VisualMpcNode, num_threads=4)
         mpc, (seen, goal) = self.planner.node._mpc, first_pictures()
         plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels),
                         mpc.goal(goal.object_pixels))
@@ -58,7 +57,7 @@ class Rig:
 
 @pytest.fixture(scope='module')
 def rig():
-    with Client(namespace=SPACE) as node, World(node) as world:
+    with Client() as node, World(node) as world:
         rig = Rig(node, world)
         yield rig
         rig.client.close()

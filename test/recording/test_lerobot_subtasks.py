@@ -5,20 +5,26 @@
 import json
 
 from made_episodes import write_bag
+import numpy as np
 import pandas
 import pytest
 from tap_ros.apps.cli import main
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.formats.lerobot_subtasks import segment_names, write_subtasks
+from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
 from tap_ros.recording.marks import beside, read_marks
 
 NAMES = ('grasp', 'release')
+EPISODES = list(open_recordings('bags/sample_push2'))[:3]
+
+
+def ended(*ends):
+    return {i: Ends(ends, float(np.ptp(one.stamps)) / 1e9) for i, one in enumerate(EPISODES)}
 
 
 @pytest.fixture
 def exported(tmp_path):
-    bag = write_bag(tmp_path / 'bag', list(open_recordings('bags/sample_push2'))[:3])
+    bag = write_bag(tmp_path / 'bag', EPISODES)
     assert not main(['export-lerobot', '--recordings', str(bag), '--out', str(tmp_path / 'set')])
     return tmp_path / 'set'
 
@@ -27,7 +33,7 @@ def test_subtasks_come_back_as_marks_and_all_else_stays(exported, tmp_path):
     data = next((exported / 'data').glob('*/*.parquet'))
     before = pandas.read_parquet(data)
     for ends in ([0.5, 1.25], [0.75, 1.5]):  # again: those that there were are replaced
-        rows = write_subtasks(exported, segment_names(NAMES), dict.fromkeys(range(3), ends))
+        rows = write_subtasks(exported, segment_names(NAMES), ended(*ends))
     after = pandas.read_parquet(data)
     assert rows == len(before) and after.drop(columns='subtask_index').equals(before)
     table = pandas.read_parquet(exported / 'meta' / 'subtasks.parquet')
@@ -45,7 +51,11 @@ def test_subtasks_come_back_as_marks_and_all_else_stays(exported, tmp_path):
 def test_what_cannot_be_written_whole_is_not_written(exported, tmp_path):
     before = {path: path.read_bytes() for path in exported.rglob('*') if path.is_file()}
     with pytest.raises(ConfigError, match='episode 2 of the data set has no labels'):
-        write_subtasks(exported, segment_names(NAMES), {0: [0.5, 1], 1: [0.5, 1]})
+        write_subtasks(exported, segment_names(NAMES), dict([*ended(0.5, 1).items()][:2]))
+    one = ended(0.5, 1)
+    for other in (one | {1: Ends([0.5, 1], one[1].length + 1)}, one | {3: one[2]}):
+        with pytest.raises(ConfigError, match='episode [13] is another one than in the'):
+            write_subtasks(exported, segment_names(NAMES), other)
     with pytest.raises(RecordingError, match='is no LeRobot data set'):
         write_subtasks(tmp_path, segment_names(NAMES), {})
     assert {path: path.read_bytes() for path in exported.rglob('*') if path.is_file()} == before

@@ -144,6 +144,9 @@ def test_the_page_shows_frames_and_writes_marks_at_once(page, bag, store):
         assert state['marks'][str(i)] == [2, 4]
     assert sorted(visited) == list(range(24)) and state['next'] is None
     assert visited[1] == 23 and 8 < visited[2] < 15  # far from those before
+    path.write_text(path.read_text().replace('{"marks"', '{"names": ["a", "b"], "marks"'))
+    Marking(store, [str(bag)], path).mark(4, [2, 5])
+    assert read_marks(path, store).names == ('a', 'b')  # of who wrote them by hand
     state = json.load(ask('mark', b'{"episode": 5, "frames": []}'))
     assert state['next'] == 5 and 5 not in read_marks(path, store).episodes
     assert json.loads(json.dumps(Marking(store, [str(bag)], path).state())) == state

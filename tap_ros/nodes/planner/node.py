@@ -106,6 +106,11 @@ class VisualMpcNode(LifecycleBase):
         self._arm.close(1.0)
         self._worker.shutdown(wait=False)
 
+    def destroy_node(self) -> None:
+        """Leave the ROS graph: rclpy leaves action servers to who has made them."""
+        self._server.destroy()
+        super().destroy_node()
+
     # Lifecycle
 
     def load(self) -> str:

@@ -25,9 +25,11 @@ from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.formats.lerobot_format import (
     ACTION,
     CAMERA,
+    INDEX,
     INDICES,
     INFO,
     NAMES,
+    names_table,
     object_columns,
     OBJECTS,
     OUTCOME,
@@ -45,7 +47,6 @@ FILES_PER_CHUNK = 1000
 _FILE = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
 DATA = f'data/{_FILE}.parquet'
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
-_INDEX = {'dtype': 'int64', 'shape': [1], 'names': None}  # feature of a column of numbers
 _SAMPLED_PIXELS = 2**22  # of all pictures, for their statistics
 
 
@@ -114,7 +115,7 @@ def export(store: EpisodeStore, folder: Path,
     if marks is not None:
         names['subtask'], numbers[SUBTASK] = _subtasks(store, marks)
     features = _features(store, vectors)
-    features |= {f'{key}_index': _INDEX for key in names}
+    features |= {f'{key}_index': INDEX for key in names}
     rows = list(tqdm(_write_files(store, folder, numbers), 'exporting', len(store),
                      unit='episode', delay=1))
     _write_meta(folder, features, names, rows, fps)
@@ -150,7 +151,7 @@ def _features(store: EpisodeStore, vectors: dict[str, np.ndarray]) -> dict[str, 
         **{name: {'dtype': 'float32', 'shape': [values.shape[1]], 'names': names[name]}
            for name, values in vectors.items()},
         'timestamp': {'dtype': 'float32', 'shape': [1], 'names': None},
-        **dict.fromkeys(INDICES, _INDEX)}
+        **dict.fromkeys(INDICES, INDEX)}
 
 
 def _subtasks(store: EpisodeStore,
@@ -241,20 +242,7 @@ def _write_meta(folder: Path, features: dict[str, Any], names: dict[str, dict[st
     episodes.parent.mkdir(parents=True)
     parquet.write_table(pyarrow.Table.from_pylist(rows), episodes)
     for key, numbers in names.items():
-        _write_names(folder / 'meta' / f'{key}s.parquet', key, numbers)
-
-
-def _write_names(path: Path, key: str, numbers: dict[str, int]) -> None:
-    """Write a table of numbers as pandas does whose index are the names: LeRobot uses pandas."""
-    import pyarrow
-    from pyarrow import parquet
-    table = pyarrow.table({f'{key}_index': list(numbers.values()), key: list(numbers)})
-    described = {'index_columns': [key], 'column_indexes': [], 'columns': [
-        {'name': f'{key}_index', 'field_name': f'{key}_index', 'pandas_type': 'int64',
-         'numpy_type': 'int64', 'metadata': None},
-        {'name': key, 'field_name': key, 'pandas_type': 'unicode', 'numpy_type': 'object',
-         'metadata': None}]}
-    parquet.write_table(table.replace_schema_metadata({'pandas': json.dumps(described)}), path)
+        parquet.write_table(names_table(key, numbers), folder / 'meta' / f'{key}s.parquet')
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a LeRobotDataset is made of: names, tables and videos."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+import json
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ NAMES = {ACTION: ['dx', 'dy', 'dz', 'opening'], STATE: list(GRIPPER_JOINTS)}  # 
 INDICES = ('frame_index', 'episode_index', 'index', 'task_index')  # columns that all sets have
 SUBTASK = 'subtask_index'  # column of the sets that have meta/subtasks.parquet, too
 SEED, OUTCOME = 'tap_ros/seed', 'tap_ros/outcome'  # columns of ours beside LeRobot's
+INDEX = {'dtype': 'int64', 'shape': [1], 'names': None}  # feature of a column of numbers
 MOST_BYTES, _MOST_ROWS = 2**26, 10**7  # of JSON, of a table
 _BATCH = 256  # rows that are read at once
 
@@ -28,6 +30,18 @@ _BATCH = 256  # rows that are read at once
 def object_columns(names: tuple[str, ...]) -> list[str]:
     """Return the names of the numbers in OBJECTS: u and v of each object."""
     return [f'{name}_{axis}' for name in names for axis in 'uv']
+
+
+def names_table(key: str, numbers: Mapping[str, int]) -> Any:
+    """Return numbers as pandas writes them, with the names as index: LeRobot uses pandas."""
+    import pyarrow
+    table = pyarrow.table({f'{key}_index': list(numbers.values()), key: list(numbers)})
+    described = {'index_columns': [key], 'column_indexes': [], 'columns': [
+        {'name': f'{key}_index', 'field_name': f'{key}_index', 'pandas_type': 'int64',
+         'numpy_type': 'int64', 'metadata': None},
+        {'name': key, 'field_name': key, 'pandas_type': 'unicode', 'numpy_type': 'object',
+         'metadata': None}]}
+    return table.replace_schema_metadata({'pandas': json.dumps(described)})
 
 
 def listed(values: Any) -> list[Any]:

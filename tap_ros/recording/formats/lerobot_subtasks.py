@@ -11,15 +11,32 @@ from collections.abc import Mapping, Sequence
 import json
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.files import storage_errors, write_atomically
 from tap_ros.base.text import escaped
+from tap_ros.recording.formats.lerobot_format import (
+    INDEX,
+    INFO,
+    MOST_BYTES,
+    names_table,
+    SUBTASK,
+)
 from tap_ros.recording.trust import inside, parse_json, read_bytes
 
-INFO, SUBTASKS, COLUMN = 'meta/info.json', 'meta/subtasks.parquet', 'subtask_index'
-_MOST_BYTES = 2**26  # of JSON
+
+class Ends(NamedTuple):
+    """
+    Where the subtasks of an episode end.
+
+    :param ends: of each subtask but the last one, s from the start.
+    :param length: s, of the episode, which tells whether it is that of the data set.
+    """
+
+    ends: Sequence[float]
+    length: float
 
 
 def segment_names(marks: Sequence[str]) -> list[str]:
@@ -28,8 +45,7 @@ def segment_names(marks: Sequence[str]) -> list[str]:
             f'after {marks[-1]}']
 
 
-def write_subtasks(folder: str | Path, names: Sequence[str],
-                   ends: Mapping[int, Sequence[float]]) -> int:
+def write_subtasks(folder: str | Path, names: Sequence[str], episodes: Mapping[int, Ends]) -> int:
     """
     Write subtasks into a data set; those that it had are replaced.
 
@@ -37,30 +53,36 @@ def write_subtasks(folder: str | Path, names: Sequence[str],
 
     :param folder: of the data set, with meta/info.json.
     :param names: of the subtasks, one more than the ends of an episode.
-    :param ends: {episode index: where each subtask but the last one ends, s from its start}.
+    :param episodes: all of the set, by their index.
     :return: the number of rows.
     :raises RecordingError: for a folder that holds no data set, or a damaged one; ConfigError for
-        episodes without an end; StorageError when it cannot be written. Then it is what it was.
+        other episodes than its own; StorageError when it cannot be written. Then it is what it
+        was.
     """
     import pyarrow
     from pyarrow import parquet
     root = Path(folder)
     try:
-        info = parse_json(read_bytes(inside(root, INFO), _MOST_BYTES))
-        info['features'][COLUMN] = {'dtype': 'int64', 'shape': [1], 'names': None}
+        info = parse_json(read_bytes(inside(root, INFO), MOST_BYTES))
+        info['features'][SUBTASK], fps = INDEX, float(info['fps'])
     except (OSError, RecordingError, LookupError, TypeError, ValueError) as error:
         raise RecordingError(
             f'{escaped(root)}: is no LeRobot data set: {escaped(error)}') from error
     done: dict[Path, Path] = {}
-    rows = 0
+    rows, lengths = 0, dict[int, float]()
     try:
         with storage_errors(root):
             for name in sorted(root.glob('data/*/*.parquet')):
                 path = inside(root, name.relative_to(root))
                 done[path] = path.with_name(f'{path.name}.part')
-                rows += _with_subtasks(path, done[path], ends)
+                rows += _with_subtasks(path, done[path], episodes, lengths)
             if not done:
                 raise RecordingError(f'{escaped(root)}: has no data/*/*.parquet')
+            other = [i for i in sorted({*lengths, *episodes}) if i not in lengths or abs(
+                lengths[i] - episodes[i].length) > 1.5 / fps]
+            if other:
+                raise ConfigError(f'{escaped(root)}: episode {other[0]} is another one than in '
+                                  'the recordings; name the set that they were imported from')
             for path, part in done.items():
                 os.replace(part, path)
     except pyarrow.ArrowException as error:
@@ -68,36 +90,30 @@ def write_subtasks(folder: str | Path, names: Sequence[str],
     finally:
         for part in done.values():
             part.unlink(missing_ok=True)
-    table = pyarrow.table({COLUMN: np.arange(len(names)), 'subtask': list(names)})
-    # So pandas, and by it LeRobot, reads the names as the index.
-    table = table.replace_schema_metadata({b'pandas': json.dumps({
-        'index_columns': ['subtask'], 'column_indexes': [], 'columns': [
-            {'name': name, 'field_name': name, 'pandas_type': kind, 'numpy_type': kind,
-             'metadata': None} for name, kind in ((COLUMN, 'int64'), ('subtask', 'object'))],
-        'pandas_version': '2.2.0'}).encode()})
     sink = pyarrow.BufferOutputStream()
-    parquet.write_table(table, sink)
-    write_atomically(root / SUBTASKS, sink.getvalue().to_pybytes())
+    parquet.write_table(names_table('subtask', {name: k for k, name in enumerate(names)}), sink)
+    write_atomically(root / 'meta/subtasks.parquet', sink.getvalue().to_pybytes())
     write_atomically(root / INFO, json.dumps(info, indent=4) + '\n')
     return rows
 
 
-def _with_subtasks(path: Path, part: Path, ends: Mapping[int, Sequence[float]]) -> int:
-    """Copy a data file with its rows' subtasks; return the number of rows."""
+def _with_subtasks(path: Path, part: Path, given: Mapping[int, Ends],
+                   lengths: dict[int, float]) -> int:
+    """Copy a data file with its rows' subtasks, note its episodes; return the number of rows."""
     import pyarrow
     from pyarrow import parquet
     with parquet.ParquetFile(path) as file:
         schema = file.schema_arrow
-        if COLUMN in schema.names:
-            schema = schema.remove(schema.get_field_index(COLUMN))
+        if SUBTASK in schema.names:
+            schema = schema.remove(schema.get_field_index(SUBTASK))
         for name in ('episode_index', 'timestamp'):
             if name not in schema.names:
                 raise RecordingError(f'{escaped(path)}: has no column {name}')
-        schema = schema.append(pyarrow.field(COLUMN, pyarrow.int64()))
+        schema = schema.append(pyarrow.field(SUBTASK, pyarrow.int64()))
         told = dict(schema.metadata or {})
         if b'huggingface' in told:  # the features, once more
             content = parse_json(told[b'huggingface'])
-            content['info']['features'][COLUMN] = {'dtype': 'int64', '_type': 'Value'}
+            content['info']['features'][SUBTASK] = {'dtype': 'int64', '_type': 'Value'}
             told[b'huggingface'] = json.dumps(content).encode()
         schema = schema.with_metadata(told or None)
         with parquet.ParquetWriter(part, schema) as writer:
@@ -105,13 +121,14 @@ def _with_subtasks(path: Path, part: Path, ends: Mapping[int, Sequence[float]]) 
                 episodes = batch['episode_index'].to_numpy(zero_copy_only=False)
                 times = batch['timestamp'].to_numpy(zero_copy_only=False)
                 found = np.empty(len(times), np.int64)
-                for episode in np.unique(episodes):
-                    if int(episode) not in ends:
+                for episode in np.unique(episodes).tolist():
+                    if episode not in given:
                         raise ConfigError(f'episode {episode} of the data set has no labels')
-                    rows = episodes == episode
+                    mine = episodes == episode
+                    lengths[episode] = max(lengths.get(episode, 0.0), float(times[mine].max()))
                     # A subtask ends with its last row.
-                    found[rows] = np.searchsorted(ends[int(episode)], times[rows] - 1e-4)
-                columns = [batch[name] for name in schema.names if name != COLUMN]
+                    found[mine] = np.searchsorted(given[episode].ends, times[mine] - 1e-4)
+                columns = [batch[name] for name in schema.names if name != SUBTASK]
                 writer.write_batch(pyarrow.RecordBatch.from_arrays(
                     [*columns, pyarrow.array(found)], schema=schema))
         return file.metadata.num_rows

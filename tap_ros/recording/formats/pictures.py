@@ -252,10 +252,10 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
 
 def _is_free(folder: Path) -> bool:
     """Return whether a folder holds nothing, or what an import has left that was killed."""
-    names = [path.name for path in folder.iterdir()]
+    left = list(folder.iterdir())
     ours = re.compile(rf'{re.escape(folder.resolve().name)}_\d+\.mcap(\.part)?')
-    return not names or (all(map(ours.fullmatch, names))
-                         and any(name.endswith('.part') for name in names))
+    return not left or (all(ours.fullmatch(one.name) and one.is_file() for one in left)
+                        and any(one.suffix == '.part' for one in left))
 
 
 def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
