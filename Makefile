@@ -31,7 +31,7 @@ help:
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; JOBS=4, ARGS=--list'
 	@echo 'make worlds  demonstrations of other simulators, and who finds their bottlenecks; goes on'
-	@echo 'make faults  inject every fault into real nodes and disks, in docs/results: 75 minutes;'
+	@echo 'make faults  inject every fault into real nodes and disks, in docs/results; takes long;'
 	@echo '             ARGS="-k silent": only those; ARGS="--share 0.1": a tenth of the trials'
 	@echo 'make bench   measure the speed of each part; ARGS=...'
 	@echo 'make lint    check the style of the code and its types'
