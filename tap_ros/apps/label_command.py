@@ -21,11 +21,10 @@ from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
 from tap_ros.recording.marks import beside, numbered, read_marks
 from tap_ros.recording.reading import Reading
-from tap_ros.training.labels import film_of, label, Labels
+from tap_ros.training.labels import film_of, label, Labels, SIZE
 from tqdm import tqdm
 from tyro import conf
 
-SIZE = 64  # px a side of the pictures that are described: whole ones, squeezed into a square
 WITHIN_S = (0.3, 0.5, 1.0)  # of which the share of labels is told
 SHEET_SIZE = 96, 128  # px, height and width, of a picture in the contact sheet
 SHEET_ROWS = 40  # demonstrations in it, at most
