@@ -154,5 +154,6 @@ def test_pip_brings_what_is_imported_and_the_pinned_versions_will_do(monkeypatch
     of_ros = {depend.name for depend in parse_package(str(ROOT)).exec_depends} | set(ROS_PACKAGES)
     imported = imported_packages('tap_ros', 'sim_bridge') - of_ros
     imported = {normalized(DISTRIBUTIONS.get(name, name)) for name in imported}
-    imported |= {'av', 'ray', 'tensorboard'}  # where they are there; by way of torch.utils.tensorboard
+    # Where they are there; by way of torch.utils.tensorboard.
+    imported |= {'av', 'ray', 'tensorboard'}
     assert set(bounds) | extras == imported - set(requirements('requirements-worlds.txt'))
