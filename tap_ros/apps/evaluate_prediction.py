@@ -28,7 +28,7 @@ from tap_ros.recording.bags import find_bags, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.training.frames import FilledStore
-from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few, with_masks
+from tap_ros.training.split import split_as_trained, TEST_FRACTION, warn_if_few, with_masks
 from tap_ros.weights import PREDICTORS
 from tyro import conf
 
@@ -90,9 +90,9 @@ def run(args: Options) -> None:
         raise ConfigError(f'{args.weights}: made for {size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
     robot_mask, settings = trained_robot_mask(training)[0], training.get('settings', {})
-    kept, episodes = with_masks(store, split_episodes(
-        store, settings.get('test_fraction', TEST_FRACTION),
-        held_out=() if args.all else settings.get('held_out', ())), robot_mask)
+    kept, episodes = with_masks(store, split_as_trained(
+        store, {} if args.all else training, settings.get('test_fraction', TEST_FRACTION)),
+        robot_mask)
     if args.all:
         kept, episodes = kept[:0], np.sort(np.concatenate([kept, episodes]))
     if not len(episodes):

@@ -93,7 +93,7 @@ def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_p
     found = about['marks']
     assert found['sha256'] == read_marks(marks, store).digest
     levels, = found['levels']
-    assert levels['demonstrations'] == 5 and levels['found'] >= 4 and 0 < levels['random'] < 0.8
+    assert levels['demonstrations'] == 10 and levels['found'] >= 4 and 0 < levels['random'] < 0.8
     assert about['settings']['marks'] == str(marks)
     train(config, progress=False)
     marks.write_text(marks.read_text().replace('"episode": 2', '"episode":  2'))
