@@ -164,6 +164,19 @@ class TrainedCrop:
     camera_size: tuple[int, int] | None
     size: tuple[int, int]
 
+    def is_cut(self, size: Sequence[int]) -> bool:
+        """
+        Say whether a picture that is cut already can be of a size, scaled or not.
+
+        :param size: its (height, width): not smaller than the network's, and of the shape of that,
+            or of the camera's where all of the picture is squeezed into it.
+        """
+        shapes = [self.size]
+        if self.crop.part == WHOLE and self.camera_size:
+            shapes.append(self.camera_size)
+        return (size[0] >= self.size[0] and size[1] >= self.size[1]
+                and any(size[0] * width == size[1] * height for height, width in shapes))
+
     def of(self, size: Sequence[int], name: str) -> Crop:
         """
         Say how a picture is cut.

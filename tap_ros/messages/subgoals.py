@@ -20,8 +20,9 @@ class Subgoal:
     A predicted frame: on the way to the goal, or going forward from the start.
 
     :param image: uint8 (H, W, 3).
-    :param object_maps: float32 (K, H, W), each sums to 1: where each object should then be.
-    :param expected_pixels: float32 (K, 2), the mean (u, v) under each map.
+    :param object_maps: float32 (K, h, w), each sums to 1: where each object should then be; of
+        the size that the network sees, which may be smaller than the picture.
+    :param expected_pixels: float32 (K, 2), the mean under each map, (u, v) in the picture.
     :param mass: float32 (K,), what each map summed to before normalising; far from 1 the map
         is doubtful (warp.WarpedMaps).
     :param sample: which sample it belongs to, from 0.
