@@ -19,7 +19,7 @@ from tap_ros.evaluation.intervals import share_interval
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
-from tap_ros.recording.marks import beside, numbered, read_marks
+from tap_ros.recording.marks import beside, Mark, numbered, read_marks, write_marks
 from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import film_of, label, Labels, SIZE
 from tqdm import tqdm
@@ -39,7 +39,8 @@ class Options:
 
     :param recordings: .mcap files, bag folders, or folders of these.
     :param marks: file of `python -m tap_ros mark`; by default the one beside the first recording.
-    :param out: folder for labels.json, labels.csv and labels.png.
+    :param out: folder for labels.json, labels.csv, labels.png and labels.marks.json, the labels as
+        marks.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param write_lerobot: the LeRobot data set from which the recording was imported: its rows get
         the subtasks that the labels tell apart.
@@ -82,6 +83,9 @@ def run(options: Options) -> None:
     write_atomically(out / 'labels.json', json.dumps({
         'names': names, 'marks': marks.digest, 'labels': rows}, indent=1) + '\n')
     write_atomically(out / 'labels.csv', to_csv(rows))
+    write_marks(out / 'labels.marks.json', store, options.recordings, {
+        i: those for i in range(len(store)) if (
+            those := marks.episodes.get(i) or frames_of(store, i, labels.moments[i]))}, names)
     write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
     print(worth([(films[i], marked[i]) for i in marked], labels))
     if options.write_lerobot:
@@ -98,6 +102,16 @@ def seconds_of(store: EpisodeStore, i: int, frame: int) -> float:
     """Return when a frame of an episode is, in s from its first one."""
     stamps = store[i].stamps
     return float(stamps[frame] - stamps[0]) / 1e9
+
+
+def frames_of(store: EpisodeStore, i: int, moments: np.ndarray) -> Sequence[Mark]:
+    """Return the frames of moments (M,) s as marks; none where these would not be in order."""
+    if not np.isfinite(moments).all():
+        return ()
+    stamps = store[i].stamps
+    away = np.abs((stamps - stamps[0]) / 1e9 - moments[:, None])
+    frames = away[:, 1:-1].argmin(1) + 1  # neither start nor goal
+    return [(t, t) for t in frames.tolist()] if (np.diff(frames) > 0).all() else ()
 
 
 def to_csv(rows: Sequence[dict[str, object]]) -> str:

@@ -97,6 +97,8 @@ def run(args: Options) -> None:
     subgoals = predictor.predict(
         parts['start'], parts.get('goal'), places['start'], places.get('goal'),
         num_samples=args.samples, recursion_depth=args.recursion, seed=args.seed)
+    for warning in {subgoal.warning: None for subgoal in subgoals if subgoal.warning}:
+        print(f'warning: {warning}', file=sys.stderr)
     left, top, *extent = windows['start']
     for subgoal in subgoals:
         print(f'{_title(subgoal, len(subgoals))}{":" if len(places["start"]) else ""}')

@@ -4,6 +4,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,9 @@ class Subgoal:
         is doubtful (warp.WarpedMaps).
     :param sample: which sample it belongs to, from 0.
     :param level: level of recursion, from 1, the one that is predicted from the request.
+    :param distance: of start and goal from those of the most alike demonstration, where one was
+        looked up, see prediction.retrieval; else NaN.
+    :param warning: why it is not to be trusted; '': nothing is known against it.
     """
 
     image: np.ndarray
@@ -35,6 +39,8 @@ class Subgoal:
     mass: np.ndarray
     sample: int
     level: int
+    distance: float = math.nan
+    warning: str = ''
 
 
 def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int,
@@ -63,8 +69,8 @@ def decode_subgoals(response: Any, names: Sequence[str],
     :param response: of tap_msgs/PredictSubgoal, a success.
     :param names: K strings, the order wanted of the objects.
     :param size: the (height, width) that object maps must have, or None for any that all have.
-    :return: list of Subgoal, in the order of the answer; their mass, which
-        the messages lack, is NaN.
+    :return: list of Subgoal, in the order of the answer; their mass and distance, which the
+        messages lack, are NaN.
     :raises PlanningError: when subgoals, objects or what tells them apart are missing.
     :raises ImageError: for a picture or map that cannot be used.
     """

@@ -209,6 +209,8 @@ def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],
     if len(subgoals) < wanted * task.request.recursion_depth:
         message += (f'; one sample instead of {wanted}, as these weights have no latent variable '
                     'and all samples would be the same')
+    message += ''.join(f'; {warning}' for warning in {
+        subgoal.warning: None for subgoal in subgoals if subgoal.warning})
     return PredictSubgoal.Response(
         success=True, message=message, model_time_ms=elapsed_ms,
         subgoals=[encode_subgoal(subgoal, task.names, task.stamp, task.frame_id)
