@@ -64,7 +64,7 @@ def run(options: Options) -> None:
         image_topic=options.image_topic, crop='whole', size=SIZE))
     path = Path(options.marks) if options.marks else beside(options.recordings[0])
     marks = read_marks(path, store)
-    marked = {i: np.array([seconds_of(store, i, (first + last) // 2) for first, last in those])
+    marked = {i: store.seconds(i)[[(first + last) // 2 for first, last in those]]
               for i, those in marks.episodes.items()}
     names = marks.names or tuple(
         f'mark {k + 1}' for k in range(len(next(iter(marked.values()), ()))))
@@ -91,17 +91,11 @@ def run(options: Options) -> None:
     if options.write_lerobot:
         parts = segment_names(names)
         count = write_subtasks(options.write_lerobot, parts, {
-            i: Ends(moments.tolist(), seconds_of(store, i, -1))
+            i: Ends(moments.tolist(), float(store.seconds(i)[-1]))
             for i, moments in enumerate(labels.moments)})
         print(f'{options.write_lerobot}: {count} rows with the subtasks {listing(parts)}')
     print(f'{out}: {len(store)} demonstrations labelled; look at labels.png: numbers cannot tell '
           'whether all marks are early or late')
-
-
-def seconds_of(store: EpisodeStore, i: int, frame: int) -> float:
-    """Return when a frame of an episode is, in s from its first one."""
-    stamps = store[i].stamps
-    return float(stamps[frame] - stamps[0]) / 1e9
 
 
 def frames_of(store: EpisodeStore, i: int, moments: np.ndarray) -> Sequence[Mark]:
@@ -164,7 +158,7 @@ def contact_sheet(store: EpisodeStore, labels: Labels, marked: set[int]) -> np.n
     order = sorted(usable, key=lambda i: (i in marked, labels.confidence[i].min()))[:SHEET_ROWS]
     rows = []
     for i in order:
-        frames, stamps = store.frames(i), (store[i].stamps - store[i].stamps[0]) / 1e9
+        frames, stamps = store.frames(i), store.seconds(i)
         row = []
         for name, second, sure in zip(labels.names, labels.moments[i], labels.confidence[i]):
             for offset in BEFORE_AND_AFTER_S:

@@ -16,6 +16,8 @@ OBJECT_COLOURS = (  # rgb, one per object; colour-blind readers tell them apart 
     (255, 176, 0), (100, 143, 255), (220, 38, 127), (0, 158, 115))
 GAP = 2  # white pixels between panels
 MARGIN = 8  # pixels outside a picture from where no mark reaches into it
+LARGEST = 640  # px; larger pictures are made smaller for a page
+LOSSLESS = 256  # px; larger ones are sent as JPEG
 HALO_STD, HALO = 1.3, 0.6  # pixels, and strength, of the glow around a map: sharp ones are tiny
 
 
@@ -132,6 +134,18 @@ def png_bytes(image: np.ndarray) -> bytes:
     :return: bytes of a PNG file.
     """
     return cv2.imencode('.png', np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
+
+
+def picture_bytes(image: np.ndarray, lossless: bool = False) -> bytes:
+    """Encode a picture for a page, a large one made smaller; PNG where it is small or lossless."""
+    height, width = image.shape[:2]
+    share = LARGEST / max(width, height)
+    if share < 1:
+        size = [max(1, round(share * side)) for side in (width, height)]
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    if lossless or max(width, height) <= LOSSLESS:
+        return png_bytes(image)
+    return cv2.imencode('.jpg', np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
 
 
 def grey_panels(maps: 'torch.Tensor') -> list[np.ndarray]:

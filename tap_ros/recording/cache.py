@@ -106,10 +106,28 @@ class EpisodeStore:
         table, local = self._index[i]
         return table.frames(local)
 
+    def seconds(self, i: int) -> np.ndarray:
+        """Return the times of the frames of episode i, (T,) s from its first one."""
+        table, local = self._index[i]
+        stamps = table.stamps[table.starts[local]:table.starts[local + 1]]
+        return np.asarray((stamps - stamps[0]) / 1e9)
+
+    def logs(self, i: int) -> np.ndarray:
+        """Return when the frames of episode i were logged, (T,) int64 ns."""
+        table, local = self._index[i]
+        return table.logs[table.starts[local]:table.starts[local + 1]]
+
+    def recorded(self, i: int, t: int) -> tuple[Path, str, int, int]:
+        """Return where frame t of episode i was recorded: file, topic, log time and stamp, ns."""
+        table, local = self._index[i]
+        file, index = (int(places[table.starts[local] + t]) for places in table.places['frame'])
+        part = table.parts[file]
+        log, stamp = part.arrays['frame'][index, :2].tolist()
+        return Path(part.source), part.topics['frame'], log, stamp
+
     def seen(self, i: int) -> tuple[int, int]:
         """Return the log times in ns from the first to the last frame of episode i."""
-        table, local = self._index[i]
-        logs = table.logs[table.starts[local]:table.starts[local + 1]]
+        logs = self.logs(i)
         return int(logs.min()), int(logs.max())
 
     def has_masks(self, i: int) -> bool:

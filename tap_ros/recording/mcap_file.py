@@ -130,27 +130,52 @@ class McapFile:
             channel = self.channels.get(number)
             if channel is None or channel.topic not in wanted:
                 continue
-            if data[:4] == zstandard.FRAME_HEADER:  # rosbag2 compressed it
-                with suppress(*_DAMAGE):  # who decodes it says that it is none
-                    told = zstandard.frame_content_size(data)
-                    most = _MAX_MESSAGE_BYTES if told < 0 else min(told, _MAX_MESSAGE_BYTES)
-                    self._budget.take(most)  # before it costs time
-                    content = _unpack('zstd', data, most + 1)
-                    self._budget.take(len(content) - most)
-                    if len(content) <= most:
-                        data = memoryview(content)
-            yield channel, min(log, FAR), min(publish, FAR), data
+            yield channel, min(log, FAR), min(publish, FAR), self._decompressed(data)
         self._conclude(wanted)
         self._is_read = True
+
+    def at(self, topic: str, log: int) -> list[tuple[str, memoryview]]:
+        """
+        Return type and data of the messages of a topic that were logged at a time, in ns.
+
+        Only the chunks of that time are unpacked. A file without an index has none.
+        """
+        self._budget = Budget(self._size)
+        return [(channel.type_name, self._decompressed(data)) for number, time, _, data
+                in chain.from_iterable(self._blocks_at(log)) if time == log
+                and (channel := self.channels.get(number)) and channel.topic == topic]
+
+    def _decompressed(self, data: memoryview) -> memoryview:
+        """Return what rosbag2 compressed of a message; as it is, what it did not or is damaged."""
+        if data[:4] == zstandard.FRAME_HEADER:
+            with suppress(*_DAMAGE):  # who decodes it says that it is none
+                told = zstandard.frame_content_size(data)
+                most = _MAX_MESSAGE_BYTES if told < 0 else min(told, _MAX_MESSAGE_BYTES)
+                self._budget.take(most)  # before it costs time
+                content = _unpack('zstd', data, most + 1)
+                self._budget.take(len(content) - most)
+                if len(content) <= most:
+                    return memoryview(content)
+        return data
+
+    def _blocks_at(self, log: int) -> Iterator[list[Found]]:
+        """Yield the messages of the blocks that reach over a time."""
+        for start, entry, behind in self._indexed():
+            if entry.message_start_time <= log <= entry.message_end_time:
+                yield self._unpacked(start, entry, behind)
+
+    def _indexed(self) -> Iterator[tuple[int, ChunkIndex, int]]:
+        """Yield where each chunk of the index is, in order, and where the next one begins."""
+        entries = {entry.chunk_start_offset: entry for entry in self.summary.chunk_indexes}
+        starts = sorted(entries)
+        for start, behind in zip(starts, [*starts[1:], self._size]):
+            yield start, entries[start], behind
 
     def _blocks(self) -> Iterator[list[Found]]:
         """Yield the messages of the file, block by block."""
         self._counts.clear()
         if self.summary.chunk_indexes:
-            entries = {entry.chunk_start_offset: entry for entry in self.summary.chunk_indexes}
-            starts = sorted(entries)
-            for start, behind in zip(starts, [*starts[1:], self._size]):
-                yield self._unpacked(start, entries[start], behind)
+            yield from (self._unpacked(*place) for place in self._indexed())
             return
         for start, record in self._in_order():
             yield self._unpacked(start, record) if isinstance(record, Chunk) else (

@@ -75,6 +75,13 @@ class SqliteFile(McapFile):
             self.defects.append(Defect(f'all behind is lost: {escaped(error)}', start=behind,
                                     end=self._newest))
 
+    def _blocks_at(self, log: int) -> Iterator[list[Found]]:
+        with suppress(sqlite3.Error), closing(self._open()) as base:
+            for number, data in base.execute(
+                    'SELECT topic_id, data FROM messages WHERE timestamp = ?', (log,)):
+                if isinstance(data, bytes):
+                    yield [(number, log, log, memoryview(data))]
+
     def _conclude(self, wanted: Collection[str]) -> None:
         """Leave it to what _blocks said."""
 

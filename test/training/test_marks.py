@@ -1,22 +1,14 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of marks: their file, what is learned from them and trained with it, and their page."""
+"""Laws of marks: their file, and what is learned from them and trained with it."""
 
-from contextlib import suppress
 from dataclasses import replace
 import json
-import socket
-import threading
-from urllib.error import HTTPError
-from urllib.request import Request, urlopen
 
 from made_episodes import make_episode, write_bag
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
-from tap_ros.apps.mark_command import Marking, MarkServer
 from tap_ros.base.errors import ConfigError
-from tap_ros.base.files import only_keeper
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks, write_marks
 from tap_ros.training.marks import episode_preferences, LEAST, LIKELIEST
@@ -131,90 +123,3 @@ def test_the_likeliest_frames_are_those_about_the_label(bag, store, marks, tmp_p
     for one, other in zip(back, ahead):
         np.testing.assert_array_equal(one, other[::-1])
     assert back[0].argmax(1).tolist() == [3, 1]
-
-
-@pytest.fixture
-def page(bag, store, tmp_path):
-    """Serve the page; return what asks it, and the file it writes."""
-    path = tmp_path / 'marks.json'
-    server = MarkServer(Marking(store, [str(bag)], path))
-    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-    thread.start()
-
-    def ask(place, data=None, **headers):
-        return urlopen(Request(f'http://127.0.0.1:{server.port}/{place}', data, headers))
-
-    yield ask, path
-    server.shutdown()
-    thread.join()
-    server.server_close()
-
-
-def test_the_page_shows_frames_and_writes_marks_at_once(page, bag, store):
-    ask, path = page
-    assert b'mark.js' in ask('').read() and b'ArrowLeft' in ask('mark.js').read()
-    assert ask('frame/3/2').read().startswith(b'\x89PNG')
-    state = json.load(ask('state'))
-    assert state['lengths'] == store.lengths.tolist() and state['next'] == 0
-    visited = []
-    for _ in range(24):
-        i = state['next']
-        visited.append(i)
-        state = json.load(ask('mark', json.dumps({'episode': i, 'frames': [4, 2]}).encode()))
-        assert read_marks(path, store).episodes[i] == [(2, 2), (4, 4)]
-        assert state['marks'][str(i)] == [2, 4]
-    assert sorted(visited) == list(range(24)) and state['next'] is None
-    assert visited[1] == 23 and 8 < visited[2] < 15  # far from those before
-    path.write_text(path.read_text().replace('{"marks"', '{"names": ["a", "b"], "marks"'))
-    Marking(store, [str(bag)], path).mark(4, [2, 5])
-    assert read_marks(path, store).names == ('a', 'b')  # of who wrote them by hand
-    state = json.load(ask('mark', b'{"episode": 5, "frames": []}'))
-    assert state['next'] == 5 and 5 not in read_marks(path, store).episodes
-    assert json.loads(json.dumps(Marking(store, [str(bag)], path).state())) == state
-    before = path.read_bytes()
-    for place, data, headers, code in (
-            ('mark', b'{"episode": 1, "frames": [0]}', {}, 400), ('mark', b'x', {}, 400),
-            ('mark', b'{"episode": 1, "frames": ""}', {}, 400), ('mark', b'[' * 60000, {}, 400),
-            ('mark', b' ' * 70000, {}, 413), ('mark', b'', {'Content-Length': '-1'}, 413),
-            (f'frame/{"9" * 5000}/0', None, {}, 404),
-            ('mark', b'{"episode": 1, "frames": [1]}', {'Origin': 'http://evil.example'}, 403),
-            ('state', None, {'Host': 'evil.example'}, 403), ('frame/99/0', None, {}, 404),
-            ('../setup.py', None, {}, 404)):
-        with pytest.raises(HTTPError) as error:
-            ask(place, data, **headers)
-        assert error.value.code == code, (place, data)
-    assert path.read_bytes() == before
-    path.with_name(f'{path.name}.part').mkdir()  # nothing can be written
-    with pytest.raises(HTTPError) as error:
-        ask('mark', b'{"episode": 1, "frames": [1, 2]}')
-    assert error.value.code == 507 and b'cannot be written' in error.value.read()
-    assert json.load(ask('state')) == state
-
-
-def test_connections_to_the_page_are_few_and_end_in_time(page, monkeypatch):
-    ask, _ = page
-    place = ask('state').url.split('/')[2].split(':')
-    for name, value in (('LONGEST_S', 1e9), ('MAX_CONNECTIONS', 4)):
-        monkeypatch.setattr(f'tap_ros.apps.server.{name}', value)
-    idle = [socket.create_connection(place) for _ in range(4)]
-    with socket.create_connection(place) as one:
-        assert one.recv(1) == b''
-    for one in idle:
-        one.close()
-    while True:
-        with suppress(OSError):
-            assert ask('state').read()
-            break
-    monkeypatch.setattr('tap_ros.apps.server.LONGEST_S', 0.2)
-    with socket.create_connection(place) as slow:
-        slow.sendall(b'POST /mark HTTP/1.0\r\nContent-Le')
-        assert slow.recv(1) == b''
-    assert json.load(ask('state'))
-
-
-def test_a_second_server_of_a_file_is_refused(bag, tmp_path, capsys):
-    path = tmp_path / 'marks.json'
-    with only_keeper(path):
-        assert main(['mark', str(bag), '--marks', str(path), '--port', '0']) == 1
-    assert capsys.readouterr().err.splitlines() == [
-        f'error: {path}: another process keeps it; end that one, or choose another file']

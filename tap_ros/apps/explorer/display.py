@@ -11,7 +11,6 @@ import threading
 import time
 from typing import Any
 
-import cv2
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Image
@@ -21,7 +20,7 @@ from tap_ros.base.contract import SEEN
 from tap_ros.base.errors import TapError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.base.text import escaped, listing
-from tap_ros.images.drawing import overlay, png_bytes
+from tap_ros.images.drawing import overlay
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.subgoals import decode_subgoal
@@ -29,8 +28,6 @@ from tap_ros.ros.calls import CallError
 from tap_ros.ros.topics import encode_objects, LATCHED
 
 SILENT_S = 2.0  # after which the page says that a topic is silent
-LARGEST = 640  # px; larger pictures are made smaller for the page
-LOSSLESS = 256  # px; larger ones are sent as JPEG
 NEAR = 0.06  # of the picture's width: so near are two pixels of one object
 LOG_LINES = 50
 NOTHING_SELECTED = json.dumps(
@@ -112,18 +109,6 @@ def picture_of(message: Any, kind: str) -> np.ndarray:
         return decode_image(message, kind)
     one = decode_subgoal(message, message.object_names)
     return overlay(one.image, one.object_maps)
-
-
-def picture_bytes(image: np.ndarray, lossless: bool) -> bytes:
-    """Encode a picture, a large one made smaller; PNG where it is small or `lossless`."""
-    height, width = image.shape[:2]
-    share = LARGEST / max(width, height)
-    if share < 1:
-        size = [max(1, round(share * side)) for side in (width, height)]
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    if lossless or max(width, height) <= LOSSLESS:
-        return png_bytes(image)
-    return cv2.imencode('.jpg', image[..., ::-1])[1].tobytes()
 
 
 def listed(places: Mapping[str, Place], message: ObjectStates | None = None

@@ -17,6 +17,7 @@ from tap_ros.apps.explorer.server import ExplorerServer
 from tap_ros.base.errors import TapError
 from tap_ros.base.plugins import names
 from tap_ros.base.text import escaped
+from tap_ros.images.drawing import picture_bytes
 from tap_ros.messages.images import is_empty
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.diagnostics import Diagnostics
@@ -139,7 +140,7 @@ class ExplorerNode(Node):
             try:
                 image = display.picture_of(newest[kind][0], kind)
                 shown.sizes[kind] = image.shape[1], image.shape[0]
-                self._server.put(kind, display.picture_bytes(image, kind == 'plan'))
+                self._server.put(kind, picture_bytes(image, kind == 'plan'))
             except TapError as error:
                 shown.warn(error)
         objects, goals = shown.places('objects'), shown.places('goal_objects')

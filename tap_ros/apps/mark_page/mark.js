@@ -4,103 +4,271 @@
 
 const at = (id) => document.getElementById(id);
 const THUMBNAILS = 14;
+const ASK_AGAIN_MS = 1500;  // while labels are being found
 let state = null;    // what the server knows
-let episode = 0;     // which demonstration is shown
+let about = null;    // of the demonstration that is shown: seconds of its frames, moves of its gripper
+let episode = 0;     // which one is shown
 let frame = 0;
+let draft = [];      // its frames by name, null where not yet marked; without names in order of time
+let playing = false;
+let asking = false;
 const seen = [];     // demonstrations shown before
+const passed = new Set();  // shown and left unmarked
 let done = Promise.resolve();  // when the server has all marks
 
-const picture = (t) => `frame/${episode}/${t}`;
-const marks = () => state.marks[episode] || [];
+const names = () => state.names;
+const say = (text) => { at('said').textContent = text; };
+const made = (kind, text, click) => Object.assign(document.createElement(kind), {textContent: text, onclick: click});
+const second = (t) => `${about.seconds[t].toFixed(1)} s`;
+const nameOf = (k) => names()[k] || (draft.length > 1 || !names().length ? `mark ${k + 1}` : '');
+const isSaved = () => String(draft) === String(state.marks[episode] || []);
+const given = () => draft.filter((t) => t !== null);
+const labels = () => state.marks[episode] ? [] : state.labels[episode] || [];
+
+// What the key a accepts: a frame for each name, where the gripper moves, else where the labels are.
+function proposed() {
+  const guess = labels().map(([t]) => t), moves = about.moves.map(([t]) => t);
+  const others = Object.values(state.marks).map((frames) => frames.length);
+  const count = names().length || others[0] || guess.length || moves.length;
+  if (moves.length < count) return guess.length === count ? guess : moves;
+  if (guess.length !== count) {  // a hand closes on an object before it opens
+    const first = Math.max(0, about.moves.findIndex(([, closes]) => closes));
+    return moves.slice(Math.min(first, moves.length - count)).slice(0, count);
+  }
+  const found = [];  // the moves nearest to the labels, in order
+  guess.forEach((wanted, k) => {
+    const left = moves.filter((t) => t > (found[k - 1] ?? -1));
+    const usable = left.slice(0, left.length - (count - 1 - k));
+    if (usable.length) found.push(usable.reduce((a, b) => Math.abs(b - wanted) < Math.abs(a - wanted) ? b : a));
+  });
+  return found;
+}
 
 function show(t) {
-  frame = Math.max(0, Math.min(t, state.lengths[episode] - 1));
-  at('now').src = picture(frame);
+  const last = state.lengths[episode] - 1;
+  frame = Math.max(0, Math.min(t, last));
+  at('now').src = `frame/${episode}/${frame}`;
   at('slider').value = frame;
   draw();
 }
 
-function draw() {
-  const length = state.lengths[episode];
-  at('now').className = marks().includes(frame) ? 'marked' : '';
-  at('where').textContent = `frame ${frame} of ${length - 1}`;
-  const count = Object.keys(state.marks).length;
-  at('title').textContent = `Demonstration ${episode} of 0 to ${state.lengths.length - 1}; ` +
-    `marked: ${marks().join(', ') || 'nothing'}. ${count} marked in all.`;
-  at('file').textContent = state.file;
-  for (const one of at('strip').children) {
-    const first = Number(one.dataset.first), last = Number(one.dataset.last);
-    const inside = (t) => first <= t && t <= last;
-    one.className = (marks().some(inside) ? 'marked ' : '') + (inside(frame) ? 'here' : '');
-  }
+function go(t) {
+  playing = false;
+  say('');
+  show(t);
 }
 
-function open(i) {
+function draw() {
+  const last = state.lengths[episode] - 1, count = Object.keys(state.marks).length;
+  at('now').classList.toggle('marked', draft.includes(frame));
+  at('where').textContent = `${second(frame)} of ${second(last)}, frame ${frame} of ${last}`;
+  at('count').textContent = `${count} of ${Math.max(state.enough, count)} marked`;
+  at('busy').textContent = state.busy ? 'finding labels …' : '';
+  at('play').textContent = playing ? 'Stop' : 'Play';
+  const listed = draft.map((t, k) => t === null ? `${nameOf(k)} not yet` : `${nameOf(k)} ${second(t)}`);
+  const guess = labels().map(([t, sure], k) => `${names()[k] || ''} ${second(t)} (${Math.round(100 * sure)}%)`);
+  at('title').textContent = `Demonstration ${episode} of 0 to ${state.lengths.length - 1}: ` +
+    (given().length ? listed.join(', ') + (isSaved() ? '' : ' (not saved)') : 'nothing marked') + (guess.length ? `; label: ${guess.join(', ')}` : '');
+  at('file').textContent = `saved at once in ${state.file}`;
+  drawTicks(last);
+  for (const one of at('strip').children) {
+    const inside = (t) => Number(one.dataset.first) <= t && t <= Number(one.dataset.last);
+    one.className = (draft.some((t) => t !== null && inside(t)) ? 'marked ' : labels().some(([t]) => inside(t)) ? 'labelled ' : '') +
+      (inside(frame) ? 'here' : '');
+  }
+  at('names').replaceChildren(...(names().length ? names() : ['Mark']).map((name, k) =>
+    made('button', names().length ? `${k + 1} ${name}` : name, () => mark(names().length ? k : null))));
+  const offer = proposed();
+  at('accept').hidden = !offer.length || String(offer) === String(draft);
+  at('accept').textContent = `a accept ${offer.map(second).join(', ')}`;
+  at('list').replaceChildren(...Object.entries(state.marks).map(([i, frames]) => {
+    const item = document.createElement('li');
+    item.append(made('button', `${i}: ${state.seconds[i].map((s) => `${s.toFixed(1)} s`).join(', ')}`,
+      () => { visit(Number(i), frames[0]); }));
+    item.className = Number(i) === episode ? 'here' : '';
+    return item;
+  }));
+  at('commands').replaceChildren(...(state.commands.length ? [
+    made('p', 'Enough to begin with. In a terminal, label all demonstrations, or train on the marks:'),
+    ...state.commands.map((words) => made('pre', words))] : []));
+}
+
+// The ticks of a demonstration: [frame, kind, text].
+function ticks() {
+  return [...about.moves.map(([t, closes]) => [t, 'move', closes ? 'closes' : 'opens']),
+    ...labels().map(([t], k) => [t, 'label', `${names()[k] || 'label'}?`]),
+    ...draft.flatMap((t, k) => t === null ? [] : [[t, isSaved() ? 'mark' : 'draft', nameOf(k)]])];
+}
+
+function drawTicks(last) {
+  at('ticks').replaceChildren(...ticks().map(([t, kind, text]) => {
+    const tick = made('button', text, () => go(t));
+    tick.className = kind;
+    tick.style.left = `${100 * t / last}%`;
+    return tick;
+  }));
+}
+
+async function open(i, wanted) {
+  const answer = await fetch(`about/${i}`).catch(() => null);
+  if (!answer || !answer.ok) { say('The server does not answer. Start it again.'); return; }
+  about = await answer.json();
   episode = i;
+  playing = false;
+  say('');
+  takeMarks();
   const length = state.lengths[i];
   at('slider').max = length - 1;
   at('number').value = i;
-  at('start').src = picture(0);
-  at('goal').src = picture(length - 1);
+  at('start').src = `frame/${i}/0`;
+  at('goal').src = `frame/${i}/${length - 1}`;
   const count = Math.min(THUMBNAILS, length);
   at('strip').replaceChildren(...Array.from({length: count}, (_, n) => {
     const image = new Image();
     image.dataset.first = Math.ceil(n * length / count);
     image.dataset.last = Math.ceil((n + 1) * length / count) - 1;
     const middle = Math.floor((Number(image.dataset.first) + Number(image.dataset.last)) / 2);
-    image.src = picture(middle);
-    image.onclick = () => show(middle);
+    image.src = `small/${i}/${middle}`;
+    image.onclick = () => go(middle);
     return image;
   }));
-  show(marks()[0] ?? Math.floor(length / 2));
+  show(wanted ?? given()[0] ?? proposed()[0] ?? Math.floor(length / 2));
 }
 
-async function send() {
-  const frames = marks().includes(frame) ? marks().filter((t) => t !== frame)
-    : [...marks(), frame].sort((a, b) => a - b);
-  try {
-    const answer = await fetch('mark', {method: 'POST', body: JSON.stringify({episode, frames})});
-    at('error').textContent = answer.ok ? '' : await answer.text();
-    if (answer.ok) state = await answer.json();
-  } catch {
-    at('error').textContent = 'Not marked: the server does not answer. Start it again.';
+function takeMarks() {
+  const known = state.marks[episode] || [];
+  draft = names().length && known.length !== names().length ? names().map(() => null) : [...known];
+}
+
+// Takes the newest state; asks again while labels are being found.
+function take(answer) {
+  state = answer;
+  if (!state.busy || asking) return;
+  asking = true;
+  setTimeout(async () => {
+    asking = false;
+    try { take(await (await fetch('state')).json()); draw(); } catch { /* who marks is told */ }
+  }, ASK_AGAIN_MS);
+}
+
+// Marks the frame shown: by the number of a name, or as the next one; again takes it back.
+function mark(k = null) {
+  playing = false;
+  say('');
+  if (!names().length) {
+    send(draft.includes(frame) ? draft.filter((t) => t !== frame) : [...draft, frame].sort((a, b) => a - b));
+    return;
   }
-  draw();
+  const same = draft.indexOf(frame), free = draft.indexOf(null);
+  k ??= same >= 0 ? same : Math.max(0, free);
+  if (k >= names().length) return;
+  send(draft.map((t, other) => other !== k ? t : t === frame ? null : frame));
 }
 
-const mark = () => (done = done.then(send));
-const next = () => done.then(openNext);
+// Sends marks that are complete; what is not yet stays here, and nothing of it in the file.
+function send(frames) {
+  draft = frames;
+  const missing = names().filter((_, k) => frames[k] === null || frames[k] === undefined);
+  const sent = missing.length ? [] : frames, i = episode;
+  draw();
+  if (missing.length && !state.marks[i]) return;
+  done = done.then(async () => {
+    let text = 'Not marked: the server does not answer. Start it again.';
+    try {
+      const answer = await fetch('mark', {method: 'POST', body: JSON.stringify({episode: i, frames: sent})});
+      if (answer.ok) { take(await answer.json()); text = ''; } else text = `Not saved: ${await answer.text()}`;
+    } catch { /* said above */ }
+    if (i === episode) {
+      if (!text && !missing.length) takeMarks();
+      if (text) say(text);
+    }
+    draw();
+  });
+}
 
-function openNext() {
-  if (state.next === null) return;
-  seen.push(episode);
-  // Where the one shown is left unmarked, it would be proposed for ever: take the one after it.
-  open(state.next !== episode ? state.next : (episode + 1) % state.lengths.length);
+function accept() {
+  playing = false;
+  say('');
+  const offer = proposed();
+  if (!offer.length) { say('Nothing is proposed here.'); return; }
+  send(names().length ? names().map((_, k) => offer[k] ?? null) : offer);
+  show(offer[0]);
+}
+
+async function next() {
+  await done;
+  if (!state.marks[episode]) passed.add(episode);
+  const left = state.order.filter((i) => i !== episode);
+  let fresh = left.filter((i) => !passed.has(i)), text = '';
+  if (!fresh.length && left.length) {
+    text = 'All that are not marked were shown; from the beginning.';
+    passed.clear();
+    fresh = left;
+  }
+  if (!fresh.length) { say(state.order.length ? 'This is the only one that is not marked.' : 'All are marked.'); return; }
+  await visit(fresh[0]);
+  say(text);
+}
+
+function visit(i, wanted) {
+  if (i !== episode) seen.push(episode);
+  return open(i, wanted);
 }
 
 function previous() {
   if (seen.length) open(seen.pop());
 }
 
+function fromTickToTick(step) {
+  const frames = ticks().map(([t]) => t).filter((t) => step > 0 ? t > frame : t < frame);
+  if (frames.length) go(step > 0 ? Math.min(...frames) : Math.max(...frames));
+}
+
+async function play() {
+  if (playing) { playing = false; draw(); return; }
+  const last = state.lengths[episode] - 1, i = episode;
+  say('');
+  if (frame === last) show(0);
+  playing = true;
+  const begin = performance.now() / 1000 - about.seconds[frame];
+  while (playing && i === episode && frame < last) {
+    await new Promise((go) => { requestAnimationFrame(go); });
+    const now = performance.now() / 1000 - begin;
+    if (!playing || about.seconds[frame + 1] > now) continue;
+    const later = about.seconds.findIndex((s) => s > now);
+    show(later < 0 ? last : later - 1);
+    await at('now').decode().catch(() => {});
+  }
+  if (i === episode) { playing = false; draw(); }
+}
+
 document.addEventListener('keydown', (event) => {
-  const step = event.shiftKey ? 5 : 1;
-  const action = {ArrowLeft: () => show(frame - step), ArrowRight: () => show(frame + step),
-    Enter: mark, n: next, p: previous}[event.key];
-  if (!state || !action || event.target === at('number') || event.ctrlKey || event.altKey || event.metaKey) return;
+  const step = event.shiftKey ? 5 : 1, key = event.key;
+  const action = {ArrowLeft: () => go(frame - step), ArrowRight: () => go(frame + step),
+    ArrowUp: () => fromTickToTick(-1), ArrowDown: () => fromTickToTick(1),
+    Enter: () => mark(), n: next, p: previous, a: accept, ' ': play}[key] ||
+    (/^[1-9]$/.test(key) && (() => mark(Number(key) - 1)));
+  if (!about || !action || event.target === at('number') || event.ctrlKey || event.altKey || event.metaKey) return;
   event.preventDefault();
   action();
 });
-at('slider').oninput = () => show(Number(at('slider').value));
-at('now').onclick = at('mark').onclick = mark;
+at('slider').oninput = () => go(Number(at('slider').value));
+at('now').onclick = () => mark();
+at('now').onload = () => at('now').classList.toggle('small', at('now').naturalWidth < 200);
 at('next').onclick = next;
 at('previous').onclick = previous;
+at('play').onclick = play;
+at('accept').onclick = accept;
+at('back').onclick = () => go(frame - 1);
+at('on').onclick = () => go(frame + 1);
 at('number').onchange = () => {
-  const i = Number(at('number').value);
-  if (Number.isInteger(i) && i >= 0 && i < state.lengths.length) { seen.push(episode); open(i); }
+  const i = Number(at('number').value), count = state.lengths.length;
   at('number').blur();
+  if (Number.isInteger(i) && i >= 0 && i < count) visit(i);
+  else { say(`There are demonstrations 0 to ${count - 1}.`); at('number').value = episode; }
 };
 
 (async () => {
-  state = await (await fetch('state')).json();
-  open(state.next ?? 0);
+  take(await (await fetch('state')).json());
+  await open(state.order[0] ?? 0);
 })();
