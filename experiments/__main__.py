@@ -15,6 +15,8 @@ LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weight
     'worlds-loop': ("push in another simulator's scenes, by models trained there",
                     'experiments.worlds.loop'),
     'labels': ('score labels that a few marks give all demonstrations', 'experiments.labels'),
+    'real': ('score predictors that a few marks of real demonstrations make',
+             'experiments.real'),
     'few': ('score what predictors learn from few demonstrations, simulated and real',
             'experiments.few'),
     'tracking': ('score the tracker on simulated scenes and real films', 'experiments.tracking'),
