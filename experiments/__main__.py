@@ -17,6 +17,8 @@ LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weight
     'labels': ('score labels that a few marks give all demonstrations', 'experiments.labels'),
     'few': ('score what predictors learn from few demonstrations, simulated and real',
             'experiments.few'),
+    'fullsize': ("score how sharp subgoals are at the camera's resolution",
+                 'experiments.fullsize'),
     'tracking': ('score the tracker on simulated scenes and real films', 'experiments.tracking'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'bench': ('measure speed', {
