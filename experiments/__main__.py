@@ -19,6 +19,8 @@ LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weight
              'experiments.real'),
     'few': ('score what predictors learn from few demonstrations, simulated and real',
             'experiments.few'),
+    'fullsize': ("score how sharp subgoals are at the camera's resolution",
+                 'experiments.fullsize'),
     'tracking': ('score the tracker on simulated scenes and real films', 'experiments.tracking'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'bench': ('measure speed', {

@@ -51,7 +51,7 @@ def test_flow_and_masks_read_the_full_pictures_as_they_do_the_small_ones(context
     scale = torch.tensor([size[1] / SMALL[1], size[0] / SMALL[0]])[:, None, None]
     expected = combine(
         warp(to_float(sources)[None], wide(made_here.flow[0])[None] * scale),
-        wide(made_here.masks[0])[None],
+        torch.softmax(wide(made_here.masks[0].log()), 0)[None],
         wide(made_here.new_pixels, 'bicubic') if new else None)
     found, = enlarged(made_here, [list(sources)], [size])
     assert found.shape == (*size, 3) and found.dtype == np.uint8
