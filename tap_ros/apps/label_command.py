@@ -18,14 +18,17 @@ from tap_ros.base.text import listing
 from tap_ros.evaluation.intervals import share_interval
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.events import Event, write_events
 from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
 from tap_ros.recording.marks import beside, Mark, numbered, read_marks, write_marks
+from tap_ros.recording.metadata import FILE_NAME
 from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import film_of, label, Labels, SIZE
 from tqdm import tqdm
 from tyro import conf
 
 WITHIN_S = (0.3, 0.5, 1.0)  # of which the share of labels is told
+UNSURE = 0.5  # a confidence below is a warning in the MCAP
 SHEET_SIZE = 96, 128  # px, height and width, of a picture in the contact sheet
 SHEET_ROWS = 40  # demonstrations in it, at most
 BEFORE_AND_AFTER_S = (-0.5, 0.0, 0.5)
@@ -39,8 +42,8 @@ class Options:
 
     :param recordings: .mcap files, bag folders, or folders of these.
     :param marks: file of `python -m tap_ros mark`; by default the one beside the first recording.
-    :param out: folder for labels.json, labels.csv, labels.png and labels.marks.json, the labels as
-        marks.
+    :param out: folder for labels.json, labels.csv, labels.png, labels.marks.json, the labels as
+        marks, and of each bag an MCAP file that viewers open together with it.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param write_lerobot: the LeRobot data set from which the recording was imported: its rows get
         the subtasks that the labels tell apart.
@@ -87,9 +90,13 @@ def run(options: Options) -> None:
         i: those for i in range(len(store)) if (
             those := marks.episodes.get(i) or frames_of(store, i, labels.moments[i]))}, names)
     write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
+    parts = segment_names(names)
+    for source, name in distinct_names(store).items():
+        write_events(out / f'{name}.labels.mcap', (
+            event for i in range(len(store)) if store.source(i) == source and films[i] is not None
+            for event in events_of(store, i, labels, parts)))
     print(worth([(films[i], marked[i]) for i in marked], labels))
     if options.write_lerobot:
-        parts = segment_names(names)
         count = write_subtasks(options.write_lerobot, parts, {
             i: Ends(moments.tolist(), float(store.seconds(i)[-1]))
             for i, moments in enumerate(labels.moments)})
@@ -106,6 +113,32 @@ def frames_of(store: EpisodeStore, i: int, moments: np.ndarray) -> Sequence[Mark
     away = np.abs((stamps - stamps[0]) / 1e9 - moments[:, None])
     frames = away[:, 1:-1].argmin(1) + 1  # neither start nor goal
     return [(t, t) for t in frames.tolist()] if (np.diff(frames) > 0).all() else ()
+
+
+def distinct_names(store: EpisodeStore) -> dict[Path, str]:
+    """Return a name for each bag of a store, by its first file: that of its folder or file."""
+    names: dict[Path, str] = {}
+    for source in dict.fromkeys(map(store.source, range(len(store)))):
+        first = source.parent.name if (source.parent / FILE_NAME).exists() else source.stem
+        name, number = first, 1
+        while name in names.values():
+            name, number = f'{first}-{number + 1}', number + 1
+        names[source] = name
+    return names
+
+
+def events_of(store: EpisodeStore, i: int, labels: Labels, parts: Sequence[str]) -> list[Event]:
+    """Return the start of a demonstration, its moments, and its end."""
+    ends = [Event(*store.recorded(i, t)[2:], subtask) for t, subtask in (
+        (0, parts[0]), (int(store.lengths[i]) - 1, ''))]
+    moments = []
+    for name, second, sure, subtask in zip(labels.names, labels.moments[i], labels.confidence[i],
+                                           parts[1:]):
+        t = int(np.abs(store.seconds(i) - second).argmin())
+        moments.append(Event(
+            *store.recorded(i, t)[2:], subtask, name,
+            f'demonstration {i} at {second:.1f} s, {sure:.0%}', sure < UNSURE))
+    return [ends[0], *moments, ends[1]]
 
 
 def to_csv(rows: Sequence[dict[str, object]]) -> str:

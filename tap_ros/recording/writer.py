@@ -7,7 +7,8 @@ Write recordings: MCAP files and bags as rosbag2 would write them with `ros2 bag
 gives equal bytes: no clock is read into the file.
 """
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, ExitStack, suppress
 import os
 from pathlib import Path
 from typing import Any, Self
@@ -187,6 +188,29 @@ class BagWriter(FileWriter):
         self.close()
 
 
+@contextmanager
+def new_file(path: str | Path, compression: str = 'zstd') -> Iterator[FileWriter]:
+    """
+    Write an MCAP file that is called path.part until the block ends without an error.
+
+    :param path: of the file; replaced when it exists.
+    """
+    path = Path(path)
+    part = path.with_name(f'{path.name}.part')
+    with storage_errors(path):
+        part.unlink(missing_ok=True)
+    file = FileWriter(part, path.name, compression)
+    try:
+        yield file
+        file.close()
+        with storage_errors(path):
+            os.replace(part, path)
+    finally:
+        file.abandon()
+        with suppress(OSError):  # on a disk that is gone
+            part.unlink(missing_ok=True)
+
+
 class EpisodeWriter:
     """
     Write finished episodes into one MCAP file, with marks where they start and end.
@@ -203,12 +227,9 @@ class EpisodeWriter:
 
     def __init__(self, path: str | Path, compression: str = 'zstd',
                  camera_matrix: ArrayLike | None = None, jpeg: bool = False) -> None:
-        self.path = Path(path)
         self._jpeg = jpeg
-        self._part = self.path.with_name(self.path.name + '.part')
-        with storage_errors(self.path):
-            self._part.unlink(missing_ok=True)
-        self._file = FileWriter(self._part, self.path.name, compression)
+        self._stack = ExitStack()
+        self._file = self._stack.enter_context(new_file(path, compression))
         self._camera_matrix = np.zeros((3, 3)) if camera_matrix is None else np.asarray(
             camera_matrix, float)
         self._last_log: int | None = None
@@ -217,16 +238,8 @@ class EpisodeWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            if kind is None:
-                self._file.close()
-                with storage_errors(self.path):
-                    os.replace(self._part, self.path)
-        finally:
-            self._file.abandon()
-            with suppress(OSError):  # on a disk that is gone
-                self._part.unlink(missing_ok=True)
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
 
     def write(self, episode: Episode) -> None:
         """

@@ -5,14 +5,19 @@
 import csv
 from dataclasses import replace
 import json
+import shutil
 
 from made_episodes import make_episode, write_bag
+from mcap.reader import make_reader
 import numpy as np
 import pytest
 from tap_ros.apps.cli import main
+from tap_ros.apps.label_command import distinct_names
 from tap_ros.base.errors import ConfigError
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks, write_marks
+from tap_ros.recording.messages import decode
 from tap_ros.training.labels import film, label, MomentModel, moments_of
 
 COUNT, MARKED = 16, 8
@@ -109,3 +114,36 @@ def test_the_command_labels_every_demonstration(tmp_path, shown, capsys):
         seconds = [row['seconds'] for row in content['labels'][2 * i:2 * i + 2]]
         assert np.allclose([first / 10 for first, _ in those], seconds, atol=0.051)
     assert (tmp_path / 'out' / 'labels.png').read_bytes()[:4] == b'\x89PNG'
+    check_events(tmp_path / 'out' / 'squares.labels.mcap', content['labels'], store)
+
+
+def check_events(path, rows, store):
+    """Hold the messages of a file of events against the labels, and the times of the recording."""
+    moments, subtasks = {}, []
+    with open(path, 'rb') as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            content = decode(schema.name, message.data)
+            if channel.topic == '/labels':
+                assert schema.name == 'rcl_interfaces/msg/Log'
+                moments[message.log_time] = content
+            else:
+                assert (channel.topic, schema.name) == ('/labels/subtask', 'std_msgs/msg/String')
+                subtasks.append((message.log_time, content.data))
+    assert subtasks == sorted(subtasks, key=lambda one: one[0])
+    assert [text for _, text in subtasks] == ['before a', 'a to b', 'after b', ''] * COUNT
+    assert [time for time, text in subtasks if text in ('before a', '')] == [
+        time for i in range(COUNT) for time in store.seen(i)]
+    assert len(moments) == len(rows)
+    for (log, one), row in zip(moments.items(), rows):
+        assert one.name == row['name'] and to_nanoseconds(one.stamp) == log
+        assert log / 1e9 == pytest.approx(row['stamp'], abs=1e-5)
+        assert one.level == (30 if row['confidence'] < 0.5 else 20)
+        assert f'{row["seconds"]:.1f} s' in one.msg
+
+
+def test_events_of_bags_with_one_name_are_kept_apart(tmp_path):
+    bags = [write_bag(tmp_path / part / 'bag', [make_episode(k)]) for k, part in enumerate('ab')]
+    loose = tmp_path / 'b' / 'alone.mcap'
+    shutil.copy(bags[1] / 'bag_0.mcap', loose)
+    store = open_recordings([*bags, loose], progress=False)
+    assert list(distinct_names(store).values()) == ['bag', 'bag-2', 'alone']

@@ -28,18 +28,16 @@ const labels = () => state.marks[episode] ? [] : state.labels[episode] || [];
 // What the key a accepts: a frame for each name, where the gripper moves, else where the labels are.
 function proposed() {
   const guess = labels().map(([t]) => t), moves = about.moves.map(([t]) => t);
+  const first = Math.max(0, about.moves.findIndex(([, closes]) => closes));  // it closes before it opens
   const others = Object.values(state.marks).map((frames) => frames.length);
-  const count = names().length || others[0] || guess.length || moves.length;
+  const count = names().length || others[0] || guess.length || moves.length - first;
   if (moves.length < count) return guess.length === count ? guess : moves;
-  if (guess.length !== count) {  // a hand closes on an object before it opens
-    const first = Math.max(0, about.moves.findIndex(([, closes]) => closes));
-    return moves.slice(Math.min(first, moves.length - count)).slice(0, count);
-  }
+  if (guess.length !== count) return moves.slice(Math.min(first, moves.length - count)).slice(0, count);
   const found = [];  // the moves nearest to the labels, in order
   guess.forEach((wanted, k) => {
     const left = moves.filter((t) => t > (found[k - 1] ?? -1));
     const usable = left.slice(0, left.length - (count - 1 - k));
-    if (usable.length) found.push(usable.reduce((a, b) => Math.abs(b - wanted) < Math.abs(a - wanted) ? b : a));
+    found.push(usable.reduce((a, b) => Math.abs(b - wanted) < Math.abs(a - wanted) ? b : a));
   });
   return found;
 }
