@@ -91,11 +91,11 @@ def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
         i: frames_of(whole, i, moments[i]) for i in marked})
     weights = train(
         options.recordings, folder, recipe='foreign', marks=str(file), image_topic=tuple(
-            filter(None, [options.image_topic])), size=SIZE, threads=1, seed=draw,
+            filter(None, [options.image_topic])), crop='centre', size=SIZE, threads=1, seed=draw,
         held_out=(f'{options.recordings}:{",".join(map(str, held_out))}',))
     network, training = load_network(weights)
     store = open_recordings(options.recordings, reading=reading_like(
-        training, options.recordings))
+        training, [options.recordings]))
     labels = label([film_of(whole, i) for i in range(len(whole))], {
         i: moments[i] for i in marked}, [options.name]).moments
     alike = NearestKeyframe(store, {
