@@ -13,6 +13,8 @@ from tap_ros.base.contract import MOST_SIGNALS
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats.lerobot_format import signal_names
+from test_importers import bair, make_frames, rlds, run_import
+from test_importers import record as tfrecord
 
 
 def with_signals(seed, names, **changes):
@@ -75,3 +77,42 @@ def test_the_numbers_of_features_get_names_within_bounds():
         'other': ['other/0', 'other/1'], 'state': ['state/x', 'state/y']}
     wide = {f'f{k}': {'dtype': 'float32', 'shape': [100]} for k in range(4)}
     assert list(signal_names(wide, wide)) == ['f0', 'f1']
+
+
+def test_floats_of_records_are_signals(tmp_path, capsys):
+    frames, state = make_frames(0, 6, 16), np.arange(12.0).tolist()
+    with open(tmp_path / 'a.tfrecord', 'wb') as file:
+        file.write(tfrecord(rlds(frames) | {'steps/observation/state': state,
+                                            'steps/odd': [1.0] * 7}))
+    for options, rows in ((), slice(None)), (('--rate', 2.5), slice(None, None, 2)):
+        bag = tmp_path / f'bag{len(options)}'
+        assert not run_import(
+            capsys, 'import-tfrecord', tmp_path, '--camera', 'image_0', '--out', bag, *options)[0]
+        episode, = open_recordings(bag)
+        assert episode.signal_names == ('observation/state/0', 'observation/state/1')
+        np.testing.assert_array_equal(episode.signals, np.reshape(state, (6, 2))[rows])
+    (tmp_path / 'a.tfrecord').write_bytes(tfrecord(bair(frames)))
+    assert not run_import(capsys, 'import-tfrecord', tmp_path, '--out', tmp_path / 'c')[0]
+    episode, = open_recordings(tmp_path / 'c')
+    assert episode.signal_names == tuple(f'action/{k}' for k in range(4))
+    np.testing.assert_array_equal(episode.signals, np.arange(4) + np.zeros((6, 1)))
+
+
+def test_numbers_beside_arrays_of_pictures_are_signals(tmp_path, capsys):
+    h5py = pytest.importorskip('h5py')
+    pictures, angles = make_frames(0, 6, 16), np.random.default_rng(0).normal(size=(6, 3))
+    with h5py.File(tmp_path / 'in.h5', 'w') as file:
+        for number in range(2):
+            demo = file.create_group(f'data/demo_{number}')
+            demo['obs/camera'], demo['obs/joints'] = pictures, angles + number
+            demo['actions'], demo['few'], demo['text'] = np.arange(6), angles[:4], np.array(
+                [b'a'] * 6)
+        file['data/all'] = angles  # of no demonstration
+        layout = h5py.VirtualLayout((6, 2), 'f8')
+        file.create_virtual_dataset('data/demo_0/elsewhere', layout)
+    assert not run_import(capsys, 'import-arrays', tmp_path / 'in.h5', '--fps', 4, '--rate', 2,
+                          '--out', tmp_path / 'bag')[0]
+    for number, episode in enumerate(open_recordings(tmp_path / 'bag')):
+        assert episode.signal_names == ('actions', *(f'obs/joints/{k}' for k in range(3)))
+        np.testing.assert_allclose(episode.signals, np.concatenate(
+            [np.arange(6)[:, None], angles + number], 1)[::2], rtol=1e-6)
