@@ -20,7 +20,7 @@ from tap_ros.images.encodings import decompress
 from tap_ros.images.pixels import resize_image, to_float, to_uint8
 from tap_ros.prediction.retrieval import (
     ends_of,
-    nearest,
+    nearest_others,
     SIDE,
     spread_out,
     unlike,
@@ -117,20 +117,14 @@ class KeyframeBank:
 
     def find(self, pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Find the keyframes of the most alike demonstrations.
-
-        One whose start and goal are exactly those that are asked is the same demonstration, and
-        left out if there are others: in training, too, none is its own neighbour.
+        Find the keyframes of the most alike demonstrations, see retrieval.nearest_others.
 
         :param pictures: uint8 (B, 2, H, W, 3), start and goal as the network is given them.
         :return: indices int64 (B,), and distances (B,), see retrieval.
         """
         asked = np.stack([ends_of(*pair) for pair in pictures])
-        indices, distances = nearest(asked, self._ends, 2)
-        rows, column = np.arange(len(asked)), np.zeros(len(asked), int)
-        if len(self) > 1:
-            column[distances[:, 0] == 0] = 1
-        return indices[rows, column], distances[rows, column]
+        indices, distances = nearest_others(asked, self._ends, 1)
+        return indices[:, 0], distances[:, 0]
 
     def unlike(self, distance: float) -> str:
         """Say that start and goal are unlike those of all demonstrations; '': they are not."""
