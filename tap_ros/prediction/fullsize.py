@@ -20,6 +20,7 @@ from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.protocol import Request
 
 LEAST = 1e-6  # of a mask
+STEEPER = 1.5  # edges of enlarged masks; nearer to the truth than 1 in pushing, stacking, grasping
 
 
 def pictures_of(request: Request) -> list[np.ndarray]:
@@ -75,7 +76,7 @@ def _enlarged(prediction: Prediction, b: int, sources: Sequence[np.ndarray],
     """Return the prediction in row b at a size; see enlarged."""
     flows = prediction.flow[b].cpu().numpy()  # C, 2, h, w
     # Before their softmax masks have less of an edge to blur: C or C + 1, h, w.
-    logits = prediction.masks[b, :, 0].clamp(min=LEAST).log().cpu().numpy()
+    logits = STEEPER * prediction.masks[b, :, 0].clamp(min=LEAST).log().cpu().numpy()
     masks = [cv2.exp(_wide(one, size)) for one in logits]
     layers = [_read(source, flow, size) for source, flow in zip(sources, flows, strict=True)]
     if prediction.new_pixels is not None:

@@ -181,6 +181,7 @@ def test_answers_are_as_large_as_the_pictures_and_those_of_the_predictor_itself(
     large = dict(zip(('start', 'goal'), (
         encode_image(one, STAMP, 'eye') for one in enlarged_pictures(960))))
     assert [one.image.width for one in service.answer(**large).subgoals] == [960]
+    shown['overlay'].wait(10, lambda m: m.width == m.height == 640)
     many = service.answer(num_samples=20, **large).subgoals
     assert [(one.image.width, one.image.height) for one in many] == 20 * [(32, 32)]
 
