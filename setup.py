@@ -51,10 +51,11 @@ setup(
     # colcon takes what package.xml names: of apt's packages some are no distributions.
     install_requires=REQUIRED if 'setuptools.build_meta' in sys.modules else ['setuptools'],
     extras_require={  # what only some commands need; `colcon test` runs pytest because of the last
+        'video': ['av'],
         'tfrecord': ['google-crc32c', 'protobuf'],
         'arrays': ['h5py'],
         'explorer': ['websockets'],
-        'lerobot': ['pyarrow>=14.0.1'],  # those before run code that is in a file
+        'lerobot': ['av', 'pyarrow>=14.0.1'],  # those before run code that is in a file
         'ray': ['ray'],
         'test': ['pytest'],
     },

@@ -108,7 +108,7 @@ def curve(args):
             weights = train(
                 files[:count // IN_A_FILE], Path(args.runs, f'{args.task}_{count}_{seed}'),
                 seed=seed, held_out=(str(held_out_of(bag)),), marks=str(marks_of(bag, 0)),
-                selection='marks', **SETTINGS)
+                selection='marks', start_crop=0.0, **SETTINGS)
             store, scores = score(weights, [held_out_of(bag)])
             truth = read_marks(held_out_of(bag) / BOTTLENECKS_FILE, store).episodes
             beside = [max(first - t, t - last, 0) for t, ((first, last), *_) in zip(

@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 
 import numpy as np
-from tap_ros.apps.label_command import SIZE, WITHIN_S
+from tap_ros.apps.label_command import WITHIN_S
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import File, Folder, Topic
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
-from tap_ros.training.labels import Film, film_of, label
+from tap_ros.training.labels import Film, film_of, label, SIZE
 from tqdm import tqdm
 
 

@@ -41,7 +41,7 @@ import tyro  # noqa: E402
 FILE = ROOT / 'test' / 'golden.json'
 SAMPLE = ROOT / 'bags' / 'sample_push2'
 QUICK = [str(SAMPLE), '--steps', '10', '--batch-size', '4', '--test-fraction', '0.3', '--threads',
-         '1', '--device', 'cpu']
+         '1', '--device', 'cpu', '--split', 'crc32']
 PREDICTOR = ['predictor', *QUICK, '--precision', 'float32', '--base-width', '4', '--start-crop',
              '0', '--progress-margin', '0']
 PAPER = [*PREDICTOR, '--decoder', 'separate', '--no-skips']

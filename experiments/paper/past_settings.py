@@ -21,4 +21,4 @@ def todays_settings(settings):
     kept = {name: value for name, value in settings.items()
             if name != 'method' and (name not in gone or value != gone[name])}
     named = method_fields(settings['method']) if 'method' in settings else {}
-    return asdict(TrainingConfig(recordings=())) | kept | named
+    return asdict(TrainingConfig(recordings=(), split='crc32')) | kept | named

@@ -44,7 +44,7 @@ def write_picture(places, runs):
             path.exists() for path in weights.values()):
         return
     run, store = by_name[shown[MATCHED]], open_recordings([places.recording(TASK)])
-    _, held_out = split_episodes(store, run['config']['test_fraction'])
+    _, held_out = split_episodes(store, run['config']['test_fraction'], split='crc32')
     if len(held_out) and store.data_hash == run['data']['hash']:
         columns = panels({method: load_network(path)[0] for method, path in weights.items()},
                          store, held_out[:EPISODES])

@@ -125,7 +125,7 @@ class PaperRun:
         return TrainingConfig(
             recordings=(str(Path(recordings) / self.task),), out=str(self.folder(runs)),
             mode=self.mode, **method, new_pixels=self.new_pixels, seed=self.seed,
-            test_fraction=held_out_share(self.task), recursion=self.recursion,
+            test_fraction=held_out_share(self.task), split='crc32', recursion=self.recursion,
             steps=self.num_steps, initial_weights=self.beginning, **settings)
 
     def folder(self, runs):

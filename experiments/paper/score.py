@@ -40,7 +40,7 @@ def score(run, config, weights, places):
     """
     network, about = load_network(weights, pick_device(config.device))
     store = open_recordings(list(config.recordings), progress=False)
-    _, held_out = split_episodes(store, config.test_fraction)
+    _, held_out = split_episodes(store, config.test_fraction, split=config.split)
     if not len(held_out):
         raise ConfigError(f'{config.recordings[0]}: no episode of it is held out; collect more')
     began = time.perf_counter()

@@ -64,7 +64,7 @@ def commands(name, bags='bags', runs='runs/weights'):
                            for word in (f'--{option.replace("_", "-")}', str(value))),
               '--out', folder] for folder, options in found.items()]
     lines.append(['train', 'predictor', *list(found)[:-1], '--recipe', name,
-                  '--out', str(Path(runs, name))])
+                  '--split', 'crc32', '--out', str(Path(runs, name))])
     return [shlex.join(['python', '-m', 'tap_ros', *words]) for words in lines]
 
 
@@ -81,7 +81,7 @@ def run(args):
             collect(folder, CollectConfig(**options))
         *recordings, fresh = found
         run_folder = Path(args.runs, name)
-        train(recordings, run_folder, recipe=name, threads=args.threads)
+        train(recordings, run_folder, recipe=name, split='crc32', threads=args.threads)
         Path(args.out).mkdir(parents=True, exist_ok=True)
         print(ship(name, SHIPPED[name][0], run_folder, fresh, args.out,
                    commands(name)), flush=True)

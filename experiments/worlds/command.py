@@ -34,6 +34,7 @@ from tap_ros.images.drawing import grid
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.recording.reading import Reading
+from tap_ros.training.labels import film, fit, moments_of
 from tap_ros.training.marks import chance
 from tap_ros.training.predictor_config import RECIPES
 
@@ -129,6 +130,7 @@ class Demonstration(NamedTuple):
 
     frames: np.ndarray  # (T, H, W, 3) uint8
     window: tuple[int, int]  # first and last frame of the bottleneck
+    stamps: np.ndarray  # (T,) s
     number: int = 0  # in its bag
 
 
@@ -139,7 +141,8 @@ def read(folder):
         raise ConfigError(f'{path}: is not there; collect it by a world that knows bottlenecks')
     store = open_recordings([folder], reading=Reading(size=SETTINGS['size']))
     truth = read_marks(path, store).episodes
-    return [Demonstration(store[i].frames, truth[i][0], i) for i in sorted(truth)]
+    return [Demonstration(store[i].frames, truth[i][0], store[i].stamps / 1e9, i)
+            for i in sorted(truth)]
 
 
 def score(marked, held_out):
@@ -151,25 +154,41 @@ def score(marked, held_out):
         with value, low and high, n, and the mean frames of bottlenecks and demonstrations.
     """
     from experiments.worlds import keyframes
-    methods = {
-        'middle': [keyframes.middle], 'slowest': [keyframes.slowest], 'UVD-like': [keyframes.uvd],
-        f'{MARKED} marks': [keyframes.from_marks([one.frames for one in demonstrations], frames)
-                            for demonstrations, frames in marked]}
+    guesses = {name: [[choose(one.frames) for one in held_out]] for name, choose in (
+        ('middle', keyframes.middle), ('slowest', keyframes.slowest), ('UVD-like', keyframes.uvd))}
+    guesses[f'{MARKED} marks'] = [label(demonstrations, frames, held_out)
+                                  for demonstrations, frames in marked]
     length = float(np.mean([last - first + 1 for _, (first, last), *_ in held_out]))
     rows = []
-    for name, choices in {'random': [], **methods}.items():
+    for name, draws in {'random': [], **guesses}.items():
         found = {'hit': 0, 'near': 1}
         for key, beside in found.items():
             found[key] = _interval([
-                [first - beside <= choose(frames) <= last + beside
-                 for frames, (first, last), *_ in held_out] for choose in choices
-            ]) if choices else mean_interval([
+                [first - beside <= frame <= last + beside
+                 for frame, (_, (first, last), *_) in zip(frames, held_out)] for frames in draws
+            ]) if draws else mean_interval([
                 chance(window, len(frames), beside) for frames, window, *_ in held_out])
         rows.append({'method': name, 'n': len(held_out), 'bottleneck_frames': length,
                      'frames': float(np.mean([len(one.frames) for one in held_out])),
                      **{key: Interval(*map(float, value))._asdict()
                         for key, value in found.items()}})
     return rows
+
+
+def label(marked, frames, others):
+    """Return the frames that labels by marks name in other Demonstrations."""
+    model, _ = fit(list(map(_film, marked)), [
+        one.stamps[[t]] - one.stamps[0] for one, t in zip(marked, frames)])
+    found = []
+    for one in others:
+        shown = _film(one)
+        moment = moments_of(shown, model.log_posterior(shown))[0][0]
+        found.append(int(np.abs(one.stamps - one.stamps[0] - moment).argmin()))
+    return found
+
+
+def _film(one):
+    return film(one.frames, np.rint(one.stamps * 1e9).astype(np.int64))
 
 
 def _interval(hits):

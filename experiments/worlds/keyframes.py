@@ -1,13 +1,12 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Keyframes that need no training, or a few marks only.
+Keyframes that need no training.
 
 Each takes pictures, uint8 (T, H, W, 3) from start to goal, and returns a frame between them.
 """
 
 import numpy as np
-from tap_ros.training.preference import describe, learn_preference
 
 ASIDE = 0.1  # share of the way in pictures that slowest stays away from start and goal
 
@@ -45,12 +44,6 @@ def uvd(frames):
     last = int(np.flatnonzero(distance > rest).max(initial=0))
     falls = np.flatnonzero(np.diff(distance[:last + 1]) > 0)
     return int(falls.max(initial=-1)) + 1
-
-
-def from_marks(marked, marks):
-    """Learn a time preference from marked frames; return a function from pictures to a frame."""
-    preference = learn_preference([describe(frames) for frames in marked], marks)
-    return lambda frames: preference.best(describe(frames))
 
 
 def _distances(frames, end):

@@ -42,10 +42,10 @@ BAGS = {'random': 100_000, 'goal': 0}  # of pushes; the first seed
 METHODS = ('random', 'straight', 'direct', 'subgoal')
 MARKED, MOVED = 12, 1.0  # demonstrations; px, beyond which an object has begun to move
 FORWARD = {'robot_mask': 'arm', 'initial_weights': 'push', 'batch_size': 8, 'grow': 0.3,
-           'device': 'cpu', 'threads': 1, 'save_every': 200}
-PREDICTOR = {'selection': 'marks', 'progress_margin': 0.0, 'initial_weights': 'push2',
-             'goal_picture': 'recorded', 'robot_mask': 'arm', 'fill_context': 1.0,
-             'batch_size': 8, 'device': 'cpu', 'threads': 1}
+           'device': 'cpu', 'threads': 1, 'save_every': 200, 'split': 'crc32'}
+PREDICTOR = {'selection': 'marks', 'progress_margin': 0.0, 'start_crop': 0.0,
+             'initial_weights': 'push2', 'goal_picture': 'recorded', 'robot_mask': 'arm',
+             'fill_context': 1.0, 'batch_size': 8, 'device': 'cpu', 'threads': 1}
 # Half of what is usual, so that a plan takes half the time.
 PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threads=1)
 REACHED = 2.0  # px, here about cm: within this, the object is at its goal

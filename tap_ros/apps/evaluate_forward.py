@@ -18,7 +18,7 @@ from tap_ros.recording.bags import find_bags, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.forward_scores import measure_maps, measure_pictures, MOVED_PIXELS
 from tap_ros.training.frames import FilledStore
-from tap_ros.training.split import split_episodes, TEST_FRACTION, with_masks
+from tap_ros.training.split import split_as_trained, TEST_FRACTION, with_masks
 from tap_ros.weights import FORWARD_MODEL
 from tap_ros.weights.weights import load_weights
 
@@ -49,7 +49,8 @@ class Options:
     :param recordings: bag folders; each is scored on its own: by object pixels, else by pictures.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param weights: of a forward model.
-    :param test_fraction: share of the episodes that training held out, by seed; 1: all.
+    :param test_fraction: 1: all episodes, not only those that training held out; else the share
+        of these, of weights that do not tell which they are.
     :param device: cpu or cuda.
     :param out: write forward_model.json there.
     """
@@ -80,8 +81,7 @@ def run(args: Options) -> None:
                               f'{recording} has {store.image_size}; use matching ones')
         robot_mask, everything = model.config.robot_mask, np.arange(len(store))
         held_out = with_masks(store, (everything, everything) if args.test_fraction >= 1 else (
-            split_episodes(store, args.test_fraction, held_out=training.get('settings', {}).get(
-                'held_out', ()))), robot_mask)[1]
+            split_as_trained(store, training, args.test_fraction)), robot_mask)[1]
         filled = store if robot_mask == 'none' else FilledStore(
             store, robot_mask, filling=fill_from_past)
         measured = measure_maps(model, filled, held_out) or measure_pictures(

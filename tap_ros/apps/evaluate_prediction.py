@@ -13,8 +13,8 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import Bags, File, Flag, Folder, Topic
 from tap_ros.base.text import listing
-from tap_ros.evaluation.hits import score_hits
-from tap_ros.evaluation.intervals import Interval, mean_interval
+from tap_ros.evaluation.hits import score_hits, seconds_off
+from tap_ros.evaluation.intervals import against_copying, Interval, mean_interval, share_interval
 from tap_ros.evaluation.prediction import EpisodeScores, evaluate, verdict
 from tap_ros.evaluation.samples import SAMPLES, score_samples
 from tap_ros.evaluation.strips import draw_strips
@@ -28,13 +28,14 @@ from tap_ros.recording.bags import find_bags, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.training.frames import FilledStore
-from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few, with_masks
+from tap_ros.training.split import split_as_trained, TEST_FRACTION, warn_if_few, with_masks
 from tap_ros.weights import PREDICTORS
 from tyro import conf
 
 _SHOWN = ('min_l1', 'copying_l1', 'changed_l1', 'match_fraction', 'match_fraction_std',
           'bottleneck_median', 'bottleneck_1px', 'bottleneck_2px', 'visible_bottleneck_2px',
           'bottleneck_5px', 'shows_hand', 'shows_objects', 'shows_both')
+WITHIN_S = (0.3, 0.5, 1.0)  # of a mark
 _STRIPS = 12  # episodes that are drawn
 _SEEN = 20  # of those trained on, so many are scored, or as many as are held out
 
@@ -89,9 +90,9 @@ def run(args: Options) -> None:
         raise ConfigError(f'{args.weights}: made for {size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
     robot_mask, settings = trained_robot_mask(training)[0], training.get('settings', {})
-    kept, episodes = with_masks(store, split_episodes(
-        store, settings.get('test_fraction', TEST_FRACTION),
-        held_out=() if args.all else settings.get('held_out', ())), robot_mask)
+    kept, episodes = with_masks(store, split_as_trained(
+        store, {} if args.all else training, settings.get('test_fraction', TEST_FRACTION)),
+        robot_mask)
     if args.all:
         kept, episodes = kept[:0], np.sort(np.concatenate([kept, episodes]))
     if not len(episodes):
@@ -104,7 +105,8 @@ def run(args: Options) -> None:
             'marks: none of the episodes that are scored is marked; mark some of them, in the '
             f'order of the recordings from 0: {listing(episodes)}; or give --all')
     filled = None if robot_mask == 'none' else FilledStore(store, robot_mask)
-    scores = evaluate(network, store, episodes, args.goal_picture, filled)
+    scores = evaluate(network, store, episodes, args.goal_picture, filled,
+                      marks.episodes if marks else {})
     sources = {store[i].object_source or 'unknown' for i in episodes if store[i].object_names}
     _print_table(scores, args.goal_picture, sources)
     warn_if_few(episodes)
@@ -121,14 +123,20 @@ def run(args: Options) -> None:
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
     if marks:
-        about['marks'] = score_hits(
-            [marks.episodes[i] for i in episodes[marked].tolist()],
-            store.lengths[episodes[marked]], scores['prediction'].match_step[marked])
+        chosen, mine = episodes[marked].tolist(), scores['prediction']
+        known, matched = [marks.episodes[i] for i in chosen], mine.match_step[marked]
+        about['marks'] = score_hits(known, store.lengths[chosen], matched)
         print(f'the matched frame is a marked one, or within one frame of it, in {len(marked)} '
               'marked episodes:')
         for name, hits in about['marks'].items():
-            print(f'{name:22s}' + ''.join(
-                f'{f"{one.value:.0%} ({one.low:.0%}, {one.high:.0%})":>20s}' for one in hits))
+            print(f'{name:22s}' + ''.join(f'{_percent(one):>20s}' for one in hits))
+        off = seconds_off(known, [store[i].stamps for i in chosen], matched)
+        within = [share_interval(off <= s + 1e-6) for s in WITHIN_S]
+        word, ratio = against_copying(mine.at_mark[marked], mine.copying_at_mark[marked])
+        print(f'the matched frame is within {", ".join(f"{s:g}" for s in WITHIN_S)} s of a mark: '
+              f'{", ".join(map(_percent, within))}\nerror at the mark: {word}; {ratio.value:.2f} '
+              f'times copying there ({ratio.low:.2f}, {ratio.high:.2f})')
+        about['marks'] |= {'seconds': within, 'error': ratio}
     if isinstance(network, PredictorNetwork) and network.config.latent_size:
         drawn = score_samples(network, store, episodes, args.goal_picture, args.samples, filled)
         about['samples'] = {'count': args.samples}
@@ -165,6 +173,10 @@ def _print_table(scores: Mapping[str, EpisodeScores], goal_picture: str,
             print(f'{name:20s}' + ''.join(
                 f'{_text(column[name]) if name in column else "-":>28s}'
                 for column in columns.values()))
+
+
+def _percent(share: Interval) -> str:
+    return f'{share.value:.0%} ({share.low:.0%}, {share.high:.0%})'
 
 
 def _text(interval: Interval) -> str:

@@ -20,14 +20,13 @@ from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.events import Event, write_events
 from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
-from tap_ros.recording.marks import beside, numbered, read_marks
+from tap_ros.recording.marks import beside, Mark, numbered, read_marks, write_marks
 from tap_ros.recording.metadata import FILE_NAME
 from tap_ros.recording.reading import Reading
-from tap_ros.training.labels import film_of, label, Labels
+from tap_ros.training.labels import film_of, label, Labels, SIZE
 from tqdm import tqdm
 from tyro import conf
 
-SIZE = 64  # px a side of the pictures that are described: whole ones, squeezed into a square
 WITHIN_S = (0.3, 0.5, 1.0)  # of which the share of labels is told
 UNSURE = 0.5  # a confidence below is a warning in the MCAP
 SHEET_SIZE = 96, 128  # px, height and width, of a picture in the contact sheet
@@ -43,8 +42,8 @@ class Options:
 
     :param recordings: .mcap files, bag folders, or folders of these.
     :param marks: file of `python -m tap_ros mark`; by default the one beside the first recording.
-    :param out: folder for labels.json, labels.csv, labels.png, and of each bag an MCAP file that
-        viewers open together with it.
+    :param out: folder for labels.json, labels.csv, labels.png, labels.marks.json, the labels as
+        marks, and of each bag an MCAP file that viewers open together with it.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param write_lerobot: the LeRobot data set from which the recording was imported: its rows get
         the subtasks that the labels tell apart.
@@ -87,6 +86,9 @@ def run(options: Options) -> None:
     write_atomically(out / 'labels.json', json.dumps({
         'names': names, 'marks': marks.digest, 'labels': rows}, indent=1) + '\n')
     write_atomically(out / 'labels.csv', to_csv(rows))
+    write_marks(out / 'labels.marks.json', store, options.recordings, {
+        i: those for i in range(len(store)) if (
+            those := marks.episodes.get(i) or frames_of(store, i, labels.moments[i]))}, names)
     write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
     parts = segment_names(names)
     for source, name in distinct_names(store).items():
@@ -127,6 +129,15 @@ def events_of(store: EpisodeStore, i: int, labels: Labels, parts: Sequence[str])
             *store.recorded(i, t)[2:], subtask, name,
             f'demonstration {i} at {second:.1f} s, {sure:.0%}', sure < UNSURE))
     return [ends[0], *moments, ends[1]]
+
+
+def frames_of(store: EpisodeStore, i: int, moments: np.ndarray) -> Sequence[Mark]:
+    """Return the frames of moments (M,) s as marks; none where these would not be in order."""
+    if not np.isfinite(moments).all():
+        return ()
+    away = np.abs(store.seconds(i) - moments[:, None])
+    frames = away[:, 1:-1].argmin(1) + 1  # neither start nor goal
+    return [(t, t) for t in frames.tolist()] if (np.diff(frames) > 0).all() else ()
 
 
 def to_csv(rows: Sequence[dict[str, object]]) -> str:

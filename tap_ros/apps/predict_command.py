@@ -24,8 +24,10 @@ from tyro import conf
 
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
+    from tap_ros.prediction.protocol import Predictor
 
-PANEL, HEAD = 260, 26  # px, side of a picture, and above it for its title
+PANEL, HEAD = 260, 26  # px, least side of a picture, and above it for its title
+LARGEST_PANEL = 480  # px; larger pictures are made smaller for the sheet
 _LARGEST = 2 ** 29  # bytes of rgb, of a picture file; phones make larger ones than cameras stream
 FAINT = 0.5  # mass of a map, below which an object is hardly in the prediction
 
@@ -78,7 +80,6 @@ def run(args: Options) -> None:
     if Path(args.out).resolve() in (Path(args.start).resolve(), Path(args.goal).resolve()):
         raise ConfigError(f'--out {escaped(args.out)}: is a picture to predict from; give another')
     predictor = load_predictor(args.weights)
-    size = predictor.image_size
     pictures, pixels = read_inputs(
         {'start': args.start or '.', 'goal': args.goal},  # an empty name is refused as a folder
         {'--objects': args.objects, '--goal-objects': args.goal_objects})
@@ -86,24 +87,26 @@ def run(args: Options) -> None:
         raise ConfigError(
             f'--objects and --goal-objects: {len(pixels["start"])} and {len(pixels["goal"])} '
             'positions; give those of the same objects in both pictures')
-    scaled, places, windows = {}, {}, {}
+    parts, places, windows = {}, {}, {}
     for name, picture in pictures.items():
         cut = Crop(args.crop) if args.crop else predictor.camera_crop.of(picture.shape[:2], name)
         if not args.crop and (why := predictor.camera_crop.unlike(picture.shape[:2], name)):
             print(f'warning: {why}', file=sys.stderr)
         windows[name] = Crop(cut.part).window(picture.shape[:2])
-        scaled[name], places[name] = fit(picture, windows[name], pixels[name], size, name)
+        parts[name], places[name] = fit(picture, windows[name], pixels[name], predictor, name)
     subgoals = predictor.predict(
-        scaled['start'], scaled.get('goal'), places['start'], places.get('goal'),
+        parts['start'], parts.get('goal'), places['start'], places.get('goal'),
         num_samples=args.samples, recursion_depth=args.recursion, seed=args.seed)
+    for warning in {subgoal.warning: None for subgoal in subgoals if subgoal.warning}:
+        print(f'warning: {warning}', file=sys.stderr)
     left, top, *extent = windows['start']
     for subgoal in subgoals:
         print(f'{_title(subgoal, len(subgoals))}{":" if len(places["start"]) else ""}')
         for k, (where, mass) in enumerate(zip(subgoal.expected_pixels, subgoal.mass), start=1):
-            u, v = (where + 0.5) * extent / size[::-1] - 0.5 + (left, top)
+            u, v = (where + 0.5) * extent / subgoal.image.shape[1::-1] - 0.5 + (left, top)
             faint = ', hardly in the picture' if mass < FAINT else ''
             print(f'  object {k} at {u:.1f},{v:.1f} (mass {mass:.2f}{faint})')
-    write_atomically(args.out, labelled(scaled, places, subgoals))
+    write_atomically(args.out, labelled(parts, places, subgoals))
     print(f'written: {escaped(args.out)}')
 
 
@@ -152,21 +155,21 @@ def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
     return np.array(pixels, np.float32).reshape(-1, 2)
 
 
-def fit(picture: np.ndarray, window: Sequence[int], pixels: np.ndarray, size: Sequence[int],
+def fit(picture: np.ndarray, window: Sequence[int], pixels: np.ndarray, predictor: 'Predictor',
         name: str) -> tuple[np.ndarray, np.ndarray]:
     """
-    Cut and scale a picture, and positions in it, to what the weights take.
+    Cut a picture, and positions in it, to what the weights take; scale them where they need it.
 
     :param picture: uint8 (H, W, 3).
-    :param window: left, top, width and height of the part, as wide as high if `size` is.
+    :param window: left, top, width and height of the part, of a shape that the weights take.
     :param pixels: (K, 2), (u, v) in the picture.
-    :param size: (height, width).
     :param name: how errors call it.
     :return: uint8 (height, width, 3) and float32 (K, 2).
     :raises ImageError: for another shape, or a position outside.
     """
-    left, top, W, H = window
-    if W * size[0] != H * size[1]:
+    (left, top, W, H), size = window, predictor.image_size
+    full = predictor.camera_crop.is_cut((H, W))
+    if not full and W * size[0] != H * size[1]:
         raise ImageError(f'{name}: {W}x{H} pixels (width x height); the weights take pictures of '
                          f'the shape {size[1]}x{size[0]}; say which part of it is used, by --crop '
                          'centre or --crop LEFT,TOP,SIDE')
@@ -176,8 +179,10 @@ def fit(picture: np.ndarray, window: Sequence[int], pixels: np.ndarray, size: Se
             f'{name}: an object is outside the part that the weights see, {W}x{H} pixels from '
             f'column {left}, row {top} on; expected column,row in the picture as it is in the '
             'file; leave others out in both pictures')
-    return (resize_image(picture[top:top + H, left:left + W], size),
-            resize_pixels(inside, (H, W), size))
+    part = np.ascontiguousarray(picture[top:top + H, left:left + W])
+    if full and getattr(predictor, 'full_size', False):
+        return part, inside
+    return resize_image(part, size), resize_pixels(inside, (H, W), size)
 
 
 def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
@@ -191,21 +196,22 @@ def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
     :return: bytes of a PNG file.
     """
     rows = []
+    side = max(PANEL, min(LARGEST_PANEL, *(max(one.image.shape) for one in subgoals)))
     for subgoal in subgoals:
         panels = [(name, picture, pixels[name]) for name, picture in pictures.items()]
         panels.append((_title(subgoal, len(subgoals)), subgoal.image, pixels['start'][:0]))
         if len(pixels['start']):
             panels.append(('where the objects are then', overlay(
                 subgoal.image, subgoal.object_maps), subgoal.expected_pixels))
-        rows.append([_panel(*panel) for panel in panels])
+        rows.append([_panel(*panel, side) for panel in panels])
     return png_bytes(grid(rows))
 
 
-def _panel(title: str, picture: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    """Draw a picture below its title, and a number beside each pixel (K, 2)."""
+def _panel(title: str, picture: np.ndarray, marks: np.ndarray, side: int) -> np.ndarray:
+    """Draw a picture below its title, as wide as `side`, and a number beside each pixel (K, 2)."""
     height, width = picture.shape[:2]
-    scale = PANEL / max(height, width)
-    image = Image.new('RGB', (PANEL, HEAD + PANEL), 'white')
+    scale = side / max(height, width)
+    image = Image.new('RGB', (side, HEAD + side), 'white')
     image.paste(Image.fromarray(picture).resize(
         (round(scale * width), round(scale * height)),
         Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX), (0, HEAD))

@@ -27,6 +27,7 @@ GOAL_TOLERANCE = 1.0  # px; the planner takes a goal or subgoal for reached with
 TABLE = 'mujoco_table'  # the world of the simulator of this package
 LOOKS = ('hand', 'arm')  # what its pictures show of the robot: the hand alone, or all of it
 DEFAULT_LOOK = 'hand'
+CAMERA_SIZE = 256  # px of its pictures where people look at them; networks see smaller ones
 
 WORLD_FRAME = 'world'  # frame of positions and commands
 CAMERA_FRAME = 'camera_optical_frame'  # of pictures: z looks ahead, x right, y down (REP 103)

@@ -25,6 +25,7 @@ import signal
 import socket
 import sys
 import threading
+from types import ModuleType
 from typing import Annotated, Any, Literal, TypeAlias
 
 from tap_ros.base.errors import check_fields, ConfigError, EngineError
@@ -80,13 +81,15 @@ class Work:
 Workers: TypeAlias = tuple[Callable[[Work], 'Future[Any]'], int, tuple[type[Exception], ...]]
 
 
-def run_tasks(tasks: Iterable[Work],
-              engine: Engine = LOCAL) -> Iterator[tuple[Work, Callable[[], Any]]]:
+def run_tasks(tasks: Iterable[Work], engine: Engine = LOCAL,
+              script: bool = True) -> Iterator[tuple[Work, Callable[[], Any]]]:
     """
     Run tasks, in their order as far as there are workers.
 
     :param tasks: iterable of Work.
     :param engine: Engine.
+    :param script: whether workers of this machine import the script that is run, which runs what
+        it does not guard by its __name__; they need it where it defines what tasks are made of.
     :return: generator of (Work, get), in the order in which they end: get() returns what the
         task returned, or raises what it raised. Tasks in progress are ended where the generator
         is closed or interrupted.
@@ -97,7 +100,8 @@ def run_tasks(tasks: Iterable[Work],
     lost: Counter[int] = Counter()  # by id of a Work
     if not waiting:
         return
-    with (_ray if engine.name == 'ray' else _pool)(engine) as (begin, room, died):
+    workers = _ray(engine) if engine.name == 'ray' else _pool(engine, script)
+    with workers as (begin, room, died):
         while waiting or running:
             while waiting and len(running) < room:
                 task = waiting.popleft()
@@ -124,7 +128,7 @@ def _result(future: 'Future[Any]') -> Any:
 
 
 @contextmanager
-def _pool(engine: Engine) -> Iterator[Workers]:
+def _pool(engine: Engine, script: bool) -> Iterator[Workers]:
     """Start processes; new ones where a worker was killed."""
     room = engine.workers or len(os.sched_getaffinity(0))
     start = partial(
@@ -136,6 +140,9 @@ def _pool(engine: Engine) -> Iterator[Workers]:
         # A terminal sends Ctrl-C to processes that begin here, too: they ignore it.
         alone = threading.current_thread() is threading.main_thread()
         before = signal.signal(signal.SIGINT, signal.SIG_IGN) if alone else None
+        main = sys.modules['__main__']
+        if not script:
+            sys.modules['__main__'] = ModuleType('__main__')  # processes that begin look there
         try:
             return pool.submit(task.function, *task.args)
         except BrokenProcessPool:
@@ -143,6 +150,7 @@ def _pool(engine: Engine) -> Iterator[Workers]:
             pool = start()
             return pool.submit(task.function, *task.args)
         finally:
+            sys.modules['__main__'] = main
             if alone:
                 signal.signal(signal.SIGINT, before)
 

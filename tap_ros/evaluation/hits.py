@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How often the frame that a prediction matches is one that a person marked."""
+"""Whether predictions show the frame that a person marked, and how well."""
 
 from collections.abc import Sequence
 
@@ -13,6 +13,20 @@ from tap_ros.training.marks import chance
 def is_hit(marks: Sequence[Mark], frame: int, off: int = 0) -> bool:
     """Say whether a frame is within one of the marks of its episode, or so many beside it."""
     return any(first - off <= frame <= last + off for first, last in marks)
+
+
+def seconds_off(marks: Sequence[Sequence[Mark]], stamps: Sequence[np.ndarray],
+                matched: np.ndarray) -> np.ndarray:
+    """
+    Say how far each matched frame is from the nearest mark of its episode.
+
+    :param marks: of each of N marked episodes; stamps: of each its frames' (T,) ns.
+    :param matched: (N,) frames that the predictions match.
+    :return: (N,) s; 0 within a mark.
+    """
+    return np.array([min(max(float(at[first] - at[t]), float(at[t] - at[last]), 0)
+                         for first, last in each) / 1e9
+                     for each, at, t in zip(marks, stamps, matched.tolist())])
 
 
 def score_hits(marks: Sequence[Sequence[Mark]], lengths: np.ndarray,

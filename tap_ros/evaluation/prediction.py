@@ -7,9 +7,10 @@ All errors are per-pixel means of the absolute difference on [0, 1]. Copying the
 picture goes through the same measurement: a low error alone proves nothing.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+import math
 
 import numpy as np
 from tap_ros.evaluation.bottleneck import (
@@ -28,6 +29,7 @@ from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.protocol import Predictor, Request
 from tap_ros.prediction.warp import WarpedMaps
 from tap_ros.recording.cache import EpisodeStore
+from tap_ros.recording.marks import Mark
 from tap_ros.training.batches import Batch, make_batch, Pictures, Sampling
 from tap_ros.training.frames import FilledStore
 import torch
@@ -53,6 +55,9 @@ class EpisodeScores:
     :param hand: (N,), how much of the hand is shown, see shown.ShownScorer; NaN where unknown.
     :param objects: (N,), likewise of the objects.
     :param copying: (N,), error of the nearer input against the frame of match_step.
+    :param at_mark: (N,), error against the marked frame, of several the one nearest to match_step;
+        NaN where none is marked.
+    :param copying_at_mark: (N,), error of the nearer input against that frame.
     """
 
     min_l1: np.ndarray
@@ -64,6 +69,8 @@ class EpisodeScores:
     hand: np.ndarray
     objects: np.ndarray
     copying: np.ndarray
+    at_mark: np.ndarray
+    copying_at_mark: np.ndarray
 
     def intervals(self) -> dict[str, Interval]:
         """
@@ -111,7 +118,8 @@ class EpisodeScores:
 
 def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
              episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-             filled: FilledStore | None = None) -> dict[str, EpisodeScores]:
+             filled: FilledStore | None = None,
+             marks: Mapping[int, Sequence[Mark]] = {}) -> dict[str, EpisodeScores]:
     """
     Measure a predictor, and copying, on episodes it was not trained on.
 
@@ -123,6 +131,7 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
     :param episodes: indices of at least one episode, each of at least 3 frames.
     :param goal_picture: see batches.make_batch.
     :param filled: the targets without the robot, see batches.make_batch.
+    :param marks: of some episodes, see marks.Marks.
     :return: dict from METHODS (without copy-goal where there is no goal) to EpisodeScores.
     """
     parts: dict[str, list[list[np.ndarray]]] = {}
@@ -141,7 +150,10 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
         for m, method in enumerate(METHODS[:errors.shape[1]]):
             match = match_step(errors[:, m], batch.valid)[:, None]
             times = batch.times.gather(1, match)
-            copied = errors[:, 1:].amin(1).gather(1, match)[:, 0].cpu().numpy()
+            copying = errors[:, 1:].amin(1)
+            copied = copying.gather(1, match)[:, 0].cpu().numpy()
+            at_mark = [_at_mark(marks.get(int(i), ()), int(time), error, copy) for i, time, error,
+                       copy in zip(chosen, times[:, 0], errors[:, m], copying)]
             row = [errors[:, m].gather(1, match), times, times / batch.end,
                    _changed_l1(images[:, m], batch, match[:, 0], measured)[:, None]]
             pictures = ((images[:, m] + 1) / 2).movedim(1, -1).cpu().numpy()
@@ -149,9 +161,16 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
                 scorers, pictures, times[:, 0].tolist())]
             parts.setdefault(method, []).append(
                 [*(part[:, 0].cpu().numpy() for part in row), placed[:, m], mass[:, m],
-                 *np.array(shown).T, copied])
+                 *np.array(shown).T, copied, *np.array(at_mark).T])
     return {method: EpisodeScores(*(np.concatenate(column) for column in zip(*rows)))
             for method, rows in parts.items()}
+
+
+def _at_mark(marks: Sequence[Mark], time: int, *errors: torch.Tensor) -> list[float]:
+    """Return errors (T,), of the frames from the second on, at the mark nearest to a time."""
+    middles = [(first + last) // 2 for first, last in marks]
+    frame = min(middles, key=lambda t: abs(t - time), default=0)
+    return [float(one[frame - 1]) if frame else math.nan for one in errors]
 
 
 def all_targets(network: PredictorNetwork | Predictor, store: EpisodeStore,

@@ -164,6 +164,19 @@ class TrainedCrop:
     camera_size: tuple[int, int] | None
     size: tuple[int, int]
 
+    def is_cut(self, size: Sequence[int]) -> bool:
+        """
+        Say whether a picture that is cut already can be of a size, scaled or not.
+
+        :param size: its (height, width): not smaller than the network's, and of the shape of that,
+            or of the camera's where all of the picture is squeezed into it.
+        """
+        shapes = [self.size]
+        if self.crop.part == WHOLE and self.camera_size:
+            shapes.append(self.camera_size)
+        return (size[0] >= self.size[0] and size[1] >= self.size[1]
+                and any(size[0] * width == size[1] * height for height, width in shapes))
+
     def of(self, size: Sequence[int], name: str) -> Crop:
         """
         Say how a picture is cut.
@@ -171,12 +184,16 @@ class TrainedCrop:
         :param size: its (height, width).
         :param name: how errors call it, for example 'goal'.
         :return: Crop; one that changes nothing for a picture that has the network's size already.
-            Where the training cut nothing, squares of a multiple of that size are scaled.
+            What is cut already, but not scaled, is scaled; where the training cut nothing, these
+            are all larger squares.
         :raises ImageError: when it is of another size and cannot be cut as in training.
         """
         given, (height, width) = tuple(size), self.size
         square = height == width and given[0] == given[1]
-        if not self.crop and square and given[0] > height and given[0] % height == 0:
+        if not self.crop and square and given[0] > height:
+            return Crop(size=height)
+        if square and self.camera_size not in (None, given) and given == (
+                self.crop.window(self.camera_size)[3:1:-1]):
             return Crop(size=height)
         if not self.crop or (given == self.size and given != self.camera_size):
             return Crop()
@@ -191,6 +208,12 @@ class TrainedCrop:
         except ImageError as error:
             raise ImageError(f'{name}: {error}') from error
         return self.crop if cut == self.size else Crop(self.crop.part, self.size[0])
+
+    def unscaled(self, size: Sequence[int], name: str) -> Crop:
+        """Say how a picture is cut, as `of`, but not made smaller."""
+        cut = self.of(size, name)
+        part = Crop(cut.part)
+        return part if self.is_cut(part.cut_size(size)) else cut
 
     def unlike(self, size: Sequence[int], name: str) -> str:
         """Say that a picture's middle shows more or less than in training; '': it does not."""

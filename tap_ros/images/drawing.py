@@ -39,30 +39,33 @@ def overlay(image: np.ndarray, object_maps: Iterable[np.ndarray], scale: int = 1
     Tint a picture where objects are expected.
 
     :param image: uint8 (H, W, 3) rgb.
-    :param object_maps: (K, H, W), each sums to 1.
+    :param object_maps: (K, h, w), each sums to 1; smaller ones than the picture are enlarged.
     :param scale: whole number of times to enlarge the picture.
     :param start_pixels: (K, 2) (u, v) marked by a circle, or None.
     :param goal_pixels: (K, 2) (u, v) marked by a cross, or None.
     :return: uint8 (H * scale, W * scale, 3).
     """
-    tinted = image.astype(np.float32)
+    tinted, size, unit = image.astype(np.float32), image.shape[1::-1], scale
     for k, probability in enumerate(object_maps):
         # The square root makes spread-out maps visible beside sharp ones.
         share = np.asarray(probability / max(probability.max(), 1e-12), np.float32)
         glow = cv2.GaussianBlur(share, (7, 7), HALO_STD, borderType=cv2.BORDER_CONSTANT)
         glow = HALO * glow / max(float(glow.max()), 1e-12)
-        strength = np.maximum(0.9 * np.sqrt(share), glow)[..., None]
+        strength = np.maximum(0.9 * np.sqrt(share), glow)
+        if strength.shape[::-1] != size:
+            unit = scale * max(1, size[0] // strength.shape[1])  # of marks: a pixel of the maps
+            strength = np.asarray(cv2.resize(strength, size, interpolation=cv2.INTER_LINEAR))
         colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)], np.float32)
-        tinted += strength * (colour - tinted)
+        tinted += strength[..., None] * (colour - tinted)
     canvas = enlarge(np.rint(tinted).astype(np.uint8), scale)
     for centre, colour in _marks(canvas, start_pixels, scale):
-        cv2.circle(canvas, centre, 3 * scale, colour, max(scale // 3, 1), cv2.LINE_AA)
-    draw_crosses(canvas, goal_pixels, scale)
+        cv2.circle(canvas, centre, 3 * unit, colour, max(unit // 3, 1), cv2.LINE_AA)
+    draw_crosses(canvas, goal_pixels, scale, unit=unit)
     return canvas
 
 
 def draw_crosses(canvas: np.ndarray, pixels: np.ndarray | None, scale: int,
-                 edge: tuple[int, int, int] | None = None) -> None:
+                 edge: tuple[int, int, int] | None = None, unit: int = 0) -> None:
     """
     Draw a cross in the colour of each object into an enlarged picture.
 
@@ -70,12 +73,14 @@ def draw_crosses(canvas: np.ndarray, pixels: np.ndarray | None, scale: int,
     :param pixels: (K, 2) (u, v) before it was enlarged, or None; those not finite are left out.
     :param scale: how many times it was enlarged.
     :param edge: (r, g, b) around the crosses, or None.
+    :param unit: pixels, a quarter of a cross; 0: the scale.
     """
-    width = max(scale // 3, 1)
+    unit = unit or scale
+    width = max(unit // 3, 1)
     for centre, colour in _marks(canvas, pixels, scale):
         for shade, wide in ((edge, 3 * width), (colour, width)):
             if shade is not None:
-                cv2.drawMarker(canvas, centre, shade, cv2.MARKER_TILTED_CROSS, 4 * scale, wide,
+                cv2.drawMarker(canvas, centre, shade, cv2.MARKER_TILTED_CROSS, 4 * unit, wide,
                                cv2.LINE_AA)
 
 

@@ -17,6 +17,7 @@ from tap_ros.messages.stamps import header_fields, Stamp
 
 MAX_FRAME_ID = 100  # characters; it comes back with every picture and map of an answer
 MAX_PIXELS = 2**24  # of a camera
+JPEG_QUALITY = 95
 
 
 def is_empty(message: Any) -> bool:
@@ -135,6 +136,17 @@ def image_fields(image: np.ndarray | None, stamp: Stamp | int, frame_id: str) ->
     else:
         check_image(image, 'image')
     return _fields(image, PICTURE_ENCODING, stamp, frame_id)
+
+
+def jpeg_fields(image: np.ndarray, stamp: Stamp | int, frame_id: str) -> dict[str, Any]:
+    """Return the fields of a sensor_msgs/CompressedImage, with all colours; else as above."""
+    import cv2  # here, as in encodings.py
+    check_image(image, 'image')
+    data = cv2.imencode('.jpg', cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [
+        cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444])[1]
+    return {'header': header_fields(stamp, frame_id), 'format': 'rgb8; jpeg compressed bgr8',
+            'data': data}
 
 
 def map_fields(values: np.ndarray, stamp: Stamp | int, frame_id: str) -> dict[str, Any]:

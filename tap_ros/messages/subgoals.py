@@ -4,6 +4,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,16 @@ class Subgoal:
     A predicted frame: on the way to the goal, or going forward from the start.
 
     :param image: uint8 (H, W, 3).
-    :param object_maps: float32 (K, H, W), each sums to 1: where each object should then be.
-    :param expected_pixels: float32 (K, 2), the mean (u, v) under each map.
+    :param object_maps: float32 (K, h, w), each sums to 1: where each object should then be; of
+        the size that the network sees, which may be smaller than the picture.
+    :param expected_pixels: float32 (K, 2), the mean under each map, (u, v) in the picture.
     :param mass: float32 (K,), what each map summed to before normalising; far from 1 the map
         is doubtful (warp.WarpedMaps).
     :param sample: which sample it belongs to, from 0.
     :param level: level of recursion, from 1, the one that is predicted from the request.
+    :param distance: of start and goal from those of the most alike demonstration, where one was
+        looked up, see prediction.retrieval; else NaN.
+    :param warning: why it is not to be trusted; '': nothing is known against it.
     """
 
     image: np.ndarray
@@ -34,6 +39,8 @@ class Subgoal:
     mass: np.ndarray
     sample: int
     level: int
+    distance: float = math.nan
+    warning: str = ''
 
 
 def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int,
@@ -55,15 +62,15 @@ def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int,
 
 
 def decode_subgoals(response: Any, names: Sequence[str],
-                    size: Sequence[int]) -> list[Subgoal]:
+                    size: Sequence[int] | None = None) -> list[Subgoal]:
     """
     Turn an answer of predict_subgoal into Subgoals.
 
     :param response: of tap_msgs/PredictSubgoal, a success.
     :param names: K strings, the order wanted of the objects.
-    :param size: the (height, width) that pictures must have.
-    :return: list of Subgoal, in the order of the answer; their mass, which
-        the messages lack, is NaN.
+    :param size: the (height, width) that object maps must have, or None for any that all have.
+    :return: list of Subgoal, in the order of the answer; their mass and distance, which the
+        messages lack, are NaN.
     :raises PlanningError: when subgoals, objects or what tells them apart are missing.
     :raises ImageError: for a picture or map that cannot be used.
     """
@@ -77,7 +84,7 @@ def decode_subgoals(response: Any, names: Sequence[str],
                 response.subgoals, response.sample, response.level)]
 
 
-def decode_subgoal(message: Any, names: Sequence[str], size: Sequence[int],
+def decode_subgoal(message: Any, names: Sequence[str], size: Sequence[int] | None = None,
                    sample: int = 0, level: int = 1) -> Subgoal:
     """
     Turn one tap_msgs/Subgoal into a Subgoal; names, size and errors are as above.
@@ -98,9 +105,12 @@ def decode_subgoal(message: Any, names: Sequence[str], size: Sequence[int],
     if not np.isfinite(pixels).all():
         raise PlanningError('subgoal: expected_pixels hold NaN or infinity; expected finite '
                             'numbers')
-    maps = [decode_map(message.object_maps[i], f'object map of {escaped(found[i])}', size)
-            for i in order]
+    image, maps = decode_image(message.image, 'image of the subgoal'), list[np.ndarray]()
+    for i in order:
+        maps.append(decode_map(message.object_maps[i], f'object map of {escaped(found[i])}', size))
+        size = size or maps[0].shape
+    size = size or image.shape[:2]
     return Subgoal(
-        image=decode_image(message.image, 'image of the subgoal', size),
-        object_maps=np.array(maps, np.float32).reshape(-1, *size), expected_pixels=pixels,
-        mass=np.full(len(order), np.nan, np.float32), sample=sample, level=level)
+        image=image, object_maps=np.array(maps, np.float32).reshape(-1, *size),
+        expected_pixels=pixels, mass=np.full(len(order), np.nan, np.float32), sample=sample,
+        level=level)

@@ -1,8 +1,8 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A baseline without a network: the keyframe of the recorded episode most like the task."""
+"""A baseline without a network: keyframes of the recorded episodes most like the task."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import os
 from typing import Any, Self
 
@@ -11,50 +11,68 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.images.crop import trained_crop
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.protocol import check_request, Predictor, Request
-from tap_ros.prediction.warp import one_hot_maps
+from tap_ros.prediction.retrieval import ends_of, nearest, unlike, usual_distance
+from tap_ros.prediction.warp import expected_pixels, one_hot_maps
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.marks import Mark, read_marks
 import torch
+
+NEIGHBOURS = 5  # episodes whose keyframes are looked at
 
 
 class NearestKeyframe(Predictor):
     """
-    Show the keyframe of the recorded episode whose first and last pictures are nearest.
+    Show the median of the keyframes of the recorded episodes that are most alike.
 
-    The keyframe is the frame half way from the first picture to the last, by what they show; with
-    recursion, of the way to the keyframe before. It is as it was recorded, so that objects are
-    where they were then, not where the request has them.
+    These are the NEIGHBOURS with the most alike start and goal pictures, see retrieval. Of each
+    the keyframe is the one that is marked, the last where several are; without marks the frame
+    half way from the first picture to the last, by what they show. With recursion it is the mark
+    before, or half way to the keyframe before. Objects are where they were in the recordings, not
+    where the request has them: an object's map is the mean of its places there.
 
-    :param episodes: with at least two frames each, of one picture size.
-    :raises ConfigError: if there is none.
+    :param episodes: of one picture size; those with less than two frames are left out.
+    :param marks: of episodes by their index, see recording.marks; the others are left out then.
+    :raises ConfigError: if there is no episode left.
     """
 
     mode = 'bidirectional'
 
-    def __init__(self, episodes: Iterable[Episode]) -> None:
-        self._episodes = [episode for episode in episodes if len(episode) > 1]
-        if not self._episodes:
-            raise ConfigError('nearest_keyframe: no recorded episode has two frames')
-        self._ends = np.stack([episode.frames[[0, -1]] for episode in self._episodes])
-        self.image_size = self._ends.shape[2:4]
+    def __init__(self, episodes: Iterable[Episode],
+                 marks: Mapping[int, Sequence[Mark]] | None = None) -> None:
+        chosen = [(episode, () if marks is None else marks[i])
+                  for i, episode in enumerate(episodes)
+                  if len(episode) > 1 and (marks is None or i in marks)]
+        if not chosen:
+            raise ConfigError('nearest_keyframe: no recorded episode has two frames'
+                              + ' and marks' * (marks is not None))
+        self._episodes, self._marks = zip(*chosen)
+        self._ends = np.stack([ends_of(episode.frames[0], episode.frames[-1])
+                               for episode in self._episodes])
+        self._usual = usual_distance(self._ends)
+        height, width = self._episodes[0].frames.shape[1:3]
+        self.image_size = (height, width)
         self.training: dict[str, Any] = {}
         self.camera_crop = trained_crop(self.training, self.image_size)
 
     @classmethod
     def load(cls, argument: str, device: Any = 'cpu') -> Self:
         """
-        Read recordings.
+        Read recordings, and marks of their episodes, such as `label` writes.
 
-        :param argument: paths, separated by ':' as in PATH.
+        :param argument: paths, separated by ':' as in PATH; one that ends in .json is of marks.
         :param device: unused.
-        :raises ConfigError: if no path is given; RecordingError: if they cannot be read.
+        :raises ConfigError: if no path is given, or marks cannot be used; RecordingError: if
+            recordings cannot be read.
         """
         paths = list(filter(None, argument.split(os.pathsep)))
-        if not paths:
-            raise ConfigError('nearest_keyframe: name its recordings, such as '
-                              'nearest_keyframe:bags/push2')
-        store = open_recordings(paths, progress=False)
-        return cls(store[i] for i in range(len(store)))
+        files = [path for path in paths if path.endswith('.json')]
+        if len(files) > 1 or len(files) == len(paths):
+            raise ConfigError('nearest_keyframe: name its recordings, and at most one file of '
+                              'marks, such as nearest_keyframe:bags/push2 or '
+                              'nearest_keyframe:bags/door:labels/labels.marks.json')
+        store = open_recordings([path for path in paths if path not in files], progress=False)
+        return cls(store, read_marks(files[0], store).episodes if files else None)
 
     def predict_together(self, requests: Sequence[Request]) -> list[list[Subgoal]]:
         """Answer requests, see Predictor; each gets one sample."""
@@ -63,16 +81,28 @@ class NearestKeyframe(Predictor):
     def _answer(self, request: Request) -> list[Subgoal]:
         """Return the keyframes for one request, the earliest first."""
         pictures, pixels = check_request(request, self.mode, self.image_size)
-        distances = [l1_distance(ends, pictures) for ends in self._ends]  # of start and goal
-        episode = self._episodes[int(np.argmin(distances))]
-        found, last = [], len(episode) - 1
+        indices, distances = nearest(ends_of(*pictures)[None], self._ends, NEIGHBOURS)
+        alike = [self._episodes[i] for i in indices[0]]
+        distance = float(distances[0, 0])
+        found, at = [], [len(episode) - 1 for episode in alike]
         for level in range(1, request.recursion_depth + 1):
-            last = halfway(episode.frames, last)
-            places = recorded_places(episode, last, pixels[0])
-            maps = one_hot_maps(torch.from_numpy(places), self.image_size).numpy()
-            found.append(Subgoal(np.array(episode.frames[last]), maps, places,
-                                 np.ones(len(places), np.float32), sample=0, level=level))
+            at = [self._keyframe(i, level, last) for i, last in zip(indices[0], at)]
+            places = np.stack([recorded_places(episode, t, pixels[0])
+                               for episode, t in zip(alike, at)])
+            maps = one_hot_maps(torch.from_numpy(places), self.image_size).mean(0)
+            image = np.median([episode.frames[t] for episode, t in zip(alike, at)], 0)
+            found.append(Subgoal(
+                image.round().astype(np.uint8), maps.numpy(), expected_pixels(maps).numpy(),
+                np.ones(len(maps), np.float32), sample=0, level=level, distance=distance,
+                warning=unlike(distance, self._usual)))
         return found[::-1]
+
+    def _keyframe(self, i: int, level: int, last: int) -> int:
+        """Return the keyframe of an episode at a level of recursion; the one before was `last`."""
+        marks = self._marks[i]
+        if level <= len(marks):
+            return sum(marks[-level]) // 2
+        return halfway(self._episodes[i].frames, last)
 
 
 def l1_distance(one: np.ndarray, other: np.ndarray) -> float:

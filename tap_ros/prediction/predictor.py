@@ -10,8 +10,9 @@ import numpy as np
 from tap_ros.base.errors import ConfigError, WeightsError
 from tap_ros.base.text import escaped
 from tap_ros.images.crop import trained_crop
-from tap_ros.images.pixels import to_float, to_uint8
+from tap_ros.images.pixels import resize_pixels, to_float
 from tap_ros.messages.subgoals import Subgoal
+from tap_ros.prediction.fullsize import answer_size, enlarged, fit, pictures_of
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.protocol import check_request, Predictor, Request
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps, WarpedMaps
@@ -26,11 +27,13 @@ class SubgoalPredictor(Predictor):
     Predict the bottleneck between a start and a goal picture, or one to come after the start.
 
     :ivar config: PredictorConfig.
-    :ivar image_size: (height, width) of the pictures it takes.
+    :ivar image_size: (height, width) of the pictures that the network sees.
     :ivar mode: 'bidirectional' for two of them, 'forward' for one.
     :ivar training: dict saying how the weights were made.
     :ivar camera_crop: TrainedCrop: what to make of a camera's pictures before it sees them.
     """
+
+    full_size = True
 
     def __init__(self, network: PredictorNetwork, training: dict[str, Any] | None = None,
                  source: str | Path = 'predictor') -> None:
@@ -94,7 +97,8 @@ class SubgoalPredictor(Predictor):
         :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
         :raises ConfigError: if a count is below 1, or a goal is missing or too much.
         """
-        scenes = [check_request(request, self.mode, self.image_size) for request in requests]
+        scenes = [check_request(fit(request, self.camera_crop), self.mode, self.image_size)
+                  for request in requests]
         alike: dict[int, list[int]] = {}  # number of objects: [index of a request]
         for index, (_, pixels) in enumerate(scenes):
             alike.setdefault(pixels.shape[1], []).append(index)
@@ -114,6 +118,8 @@ class SubgoalPredictor(Predictor):
         generators = [torch.Generator().manual_seed(request.seed) for request in requests]
         context = _join([to_float(pictures).to(self._device).expand(N, -1, -1, -1, -1)
                          for N, (pictures, _) in zip(counts, scenes)])
+        sources = [pictures_of(request) for N, request in zip(counts, requests) for _ in range(N)]
+        sizes = [answer_size(pictures) for pictures in sources]
         maps = _join([  # rows, C, K, H, W
             one_hot_maps(torch.from_numpy(pixels).to(self._device), self.image_size).expand(
                 N, -1, -1, -1, -1) for N, (_, pixels) in zip(counts, scenes)])
@@ -129,12 +135,14 @@ class SubgoalPredictor(Predictor):
                            zip(counts[:going], generators)]).to(self._device)
             prediction = self._network(context, z)
             warped = warp_object_maps(maps, prediction.flow, prediction.masks)
-            found = _to_subgoals(prediction.image, warped, counts[:going], level)
+            images = enlarged(prediction, sources[:rows], sizes)
+            found = _to_subgoals(images, warped, counts[:going], level)
             for subgoals, chain in zip(found, levels):
                 chain.append(subgoals)
             # The prediction takes the place of the last picture.
             context = torch.cat([context[:, :-1], prediction.image.clamp(-1, 1)[:, None]], 1)
             maps = torch.cat([maps[:, :-1], warped.maps[:, None]], 1)
+            sources = [[*pictures[:-1], image] for pictures, image in zip(sources, images)]
         if self.mode == 'bidirectional':
             for chain in levels:
                 chain.reverse()  # each level lies before the one that it was predicted from
@@ -164,10 +172,11 @@ def _join(parts: list[torch.Tensor]) -> torch.Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
-def _to_subgoals(images: torch.Tensor, warped: WarpedMaps, counts: Sequence[int],
+def _to_subgoals(images: Sequence[np.ndarray], warped: WarpedMaps, counts: Sequence[int],
                  level: int) -> list[list[Subgoal]]:
     """Turn the predictions of one level into lists of Subgoal, counts[i] for request i."""
-    images = to_uint8(images)
     maps, mass = warped.maps.cpu().numpy(), warped.mass.cpu().numpy()
-    rows = zip(images, maps, expected_pixels(warped.maps).cpu().numpy(), mass)
+    places = expected_pixels(warped.maps).cpu().numpy()
+    rows = zip(images, maps, [resize_pixels(at, maps.shape[-2:], image.shape[:2])
+                              for at, image in zip(places, images)], mass)
     return [[Subgoal(*next(rows), sample=n, level=level) for n in range(N)] for N in counts]

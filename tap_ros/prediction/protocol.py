@@ -53,7 +53,8 @@ class Predictor(Protocol):
     Predict the bottleneck between a start and a goal picture, or one to come after the start.
 
     :ivar mode: 'bidirectional', from start and goal, or 'forward', from the start alone.
-    :ivar image_size: (height, width) of the pictures it takes.
+    :ivar image_size: (height, width) of the pictures it takes, and of its object maps.
+    :ivar full_size: whether it takes larger pictures, too, and answers with such.
     :ivar camera_crop: what to make of a camera's pictures before it sees them.
     :ivar training: how it was made, in the form of a weights file; may be empty.
     """
@@ -62,6 +63,7 @@ class Predictor(Protocol):
     image_size: tuple[int, int]
     camera_crop: TrainedCrop
     training: Mapping[str, Any]
+    full_size: bool = False
 
     def predict_together(self, requests: Sequence[Request]) -> list[list[Subgoal]]:
         """
@@ -79,7 +81,8 @@ class Predictor(Protocol):
         """
         Predict subgoals.
 
-        :param start: uint8 (H, W, 3) rgb, what is seen now; (H, W) is image_size.
+        :param start: uint8 (H, W, 3) rgb, what is seen now; (H, W) is image_size, or larger and of
+            that shape, see full_size.
         :param goal: likewise, what is to be; None in mode 'forward'.
         :param start_pixels: (K, 2) numbers, (u, v) of each object in the start picture; (0, 0) is
             the centre of the top-left pixel. None: no objects.
@@ -89,8 +92,9 @@ class Predictor(Protocol):
         :param recursion_depth: how many subgoals in a row, at least 1.
         :param seed: of what is random; the same arguments give the same answer.
         :return: list of Subgoal: sample after sample, of each its subgoals in a row, earliest
-            first. Of each `image` uint8 (H, W, 3), `object_maps` float32 (K, H, W) that each sum
-            to 1, and `expected_pixels` float32 (K, 2).
+            first. Of each `image` uint8 (H, W, 3), as large as the larger one of the pictures,
+            `object_maps` float32 (K, h, w) of image_size that each sum to 1, and
+            `expected_pixels` float32 (K, 2), (u, v) in `image`.
         :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
         :raises ConfigError: if a count is below 1, or a goal is missing or too much.
         """

@@ -302,8 +302,8 @@ def _built(works: Sequence[Work], together: bool) -> Iterator[Work]:
     left = list(works)
     if together and len(left) > 1 and not (
             multiprocessing.current_process().daemon):  # which may not have children
-        with suppress(EngineError):  # one cannot import the user's script, or was killed
-            for work, get in run_tasks(works):
+        with suppress(EngineError):  # one was killed
+            for work, get in run_tasks(works, script=False):
                 get()
                 left.remove(work)
                 yield work

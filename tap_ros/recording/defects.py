@@ -52,16 +52,18 @@ def describe(defects: Iterable[Defect]) -> list[str]:
     Put defects in words.
 
     :param defects: list of Defect.
-    :return: list of lines, one a kind of cause, with the number of its defects and the first
-        places; of whys that differ in numbers or details the first stands for all.
+    :return: list of lines, one a kind of cause, the most frequent first, with the number of its
+        defects and the first places; of whys that differ in numbers or details the first stands
+        for all.
     """
     groups: dict[tuple[str, str], list[Defect]] = {}
     for defect in defects:
         kind = re.sub(r'\d+', '', defect.why.partition(': ')[0]) if defect.what else defect.why
         groups.setdefault((defect.what, kind), []).append(defect)
-    lines = [_line(group[0].what, group[0].why, group) for group in list(groups.values())[:CAUSES]]
+    found = sorted(groups.values(), key=len, reverse=True)
+    lines = [_line(group[0].what, group[0].why, group) for group in found[:CAUSES]]
     if len(groups) > CAUSES:
-        rest = sum(len(group) for group in list(groups.values())[CAUSES:])
+        rest = sum(len(group) for group in found[CAUSES:])
         lines.append(f'{rest} more defects, of {len(groups) - CAUSES} other causes')
     return lines
 

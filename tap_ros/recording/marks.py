@@ -100,7 +100,7 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
 
 def _episode(store: 'EpisodeStore', folder: Path, recording: str, episode: int) -> int:
     """Find an episode by its place and number; ValueError says what is wrong."""
-    inside = _inside(store, folder / recording)
+    inside = episodes_in(store, folder / recording)
     if not inside:
         raise ValueError('the recording is none of those that are read; name one by its path from '
                          f'{escaped(folder)}, or give it, too')
@@ -134,7 +134,7 @@ def _frames(stamps: np.ndarray, seconds: Sequence[Any]) -> Sequence[Mark]:
     return marks
 
 
-def _inside(store: 'EpisodeStore', place: Path) -> list[int]:
+def episodes_in(store: 'EpisodeStore', place: Path) -> list[int]:
     """Return the episodes that are recorded in a file or folder."""
     place = place.resolve()
     return [i for i in range(len(store))
@@ -146,7 +146,7 @@ def numbered(store: 'EpisodeStore', recordings: Iterable[str | Path],
     """Return of each episode its recording, as a path from a folder, and its number in it."""
     numbers: dict[int, tuple[str, int]] = {}
     for recording in recordings:
-        for number, i in enumerate(_inside(store, Path(recording))):
+        for number, i in enumerate(episodes_in(store, Path(recording))):
             numbers.setdefault(i, (os.path.relpath(Path(recording).resolve(), folder), number))
     return numbers
 

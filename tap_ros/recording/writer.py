@@ -20,7 +20,12 @@ from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.files import storage_errors
 from tap_ros.messages import topics
-from tap_ros.messages.images import camera_info_fields, image_fields, mask_fields
+from tap_ros.messages.images import (
+    camera_info_fields,
+    image_fields,
+    jpeg_fields,
+    mask_fields,
+)
 from tap_ros.messages.joints import joint_fields
 from tap_ros.messages.objects import objects_fields
 from tap_ros.messages.stamps import header_fields, stamp_fields
@@ -217,10 +222,12 @@ class EpisodeWriter:
     :param path: of the file; replaced when it exists.
     :param compression: 'zstd', 'lz4' or 'none'.
     :param camera_matrix: (3, 3) intrinsics for /camera/camera_info; None: uncalibrated (zeros).
+    :param jpeg: keep frames as JPEG, on /camera/image_raw/compressed.
     """
 
     def __init__(self, path: str | Path, compression: str = 'zstd',
-                 camera_matrix: ArrayLike | None = None) -> None:
+                 camera_matrix: ArrayLike | None = None, jpeg: bool = False) -> None:
+        self._jpeg = jpeg
         self._stack = ExitStack()
         self._file = self._stack.enter_context(new_file(path, compression))
         self._camera_matrix = np.zeros((3, 3)) if camera_matrix is None else np.asarray(
@@ -260,7 +267,13 @@ class EpisodeWriter:
         self._put(topics.CLOCK, stamp, {'clock': stamp_fields(stamp)})
         self._put(topics.CAMERA_INFO, stamp, camera_info_fields(
             self._camera_matrix, frame.shape[:2], stamp, CAMERA_FRAME))
-        self._put(topics.IMAGE, stamp, image_fields(frame, stamp, CAMERA_FRAME))
+        if self._jpeg:
+            self._file.write_raw(
+                f'{topics.IMAGE.recorded}/compressed', topics.COMPRESSED_TYPE, encode(
+                    topics.COMPRESSED_TYPE, jpeg_fields(frame, stamp, CAMERA_FRAME)),
+                stamp + self._shift)
+        else:
+            self._put(topics.IMAGE, stamp, image_fields(frame, stamp, CAMERA_FRAME))
         if episode.robot_masks is not None:
             self._put(topics.ROBOT_MASK, stamp, mask_fields(
                 episode.robot_masks[t], stamp, CAMERA_FRAME))

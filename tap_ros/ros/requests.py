@@ -47,9 +47,7 @@ def subgoals_of(response: PredictSubgoal.Response) -> list[Subgoal]:
     """Return the subgoals of an answer, their objects in the order of the first one."""
     if not response.subgoals:
         return []
-    first = response.subgoals[0]
-    return decode_subgoals(
-        response, tuple(first.object_names), (first.image.height, first.image.width))
+    return decode_subgoals(response, tuple(response.subgoals[0].object_names))
 
 
 def make_request(kind: Callable[..., Any], fields: Mapping[str, Any]) -> Any:

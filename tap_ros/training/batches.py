@@ -41,8 +41,8 @@ class Batch:
         and video are then; None: the context itself.
     :param seen: bool (B, H, W), False where the robot hides a pixel that is never free. There
         targets, video and bare are black, and nothing counts; None: True everywhere.
-    :param preference: float32 (B, levels, T), w(t) of Eq. 5 for selection marks, of each level of
-        recursion; else None.
+    :param preference: float32 (B, levels, T), w(t) of Eq. 5 for selection marks and still, of each
+        level of recursion; else None.
     :param augmentation: of all pictures that networks see; None: they see them as they are.
     """
 
@@ -85,6 +85,9 @@ class Sampling:
     What is taken from an episode; what is not told here, see predictor_config.TrainingConfig.
 
     :param forward: whether the start picture is all of the context.
+    :param around: frames on each side of the largest preferences that stay between start and
+        goal, which are drawn before and after: the ends of the episode in half of the cases. 0:
+        the ends, as the crops leave them.
     :param fraction: take only the frame at this share of the episode, 0 to 1, as fixed-time
         prediction does; None: all.
     :param num_others: with a fraction, so many random other targets after that one.
@@ -97,6 +100,7 @@ class Sampling:
     start_crop: float = 0.0
     goal_picture: str = 'last'
     forward: bool = False
+    around: int = 0
     fraction: float | None = None
     num_others: int = 0
     video_frames: int = 0
@@ -190,7 +194,8 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     :return: Batch, without augmentation.
     """
     rng = rng or np.random.default_rng(0)
-    rows = [_choose(store, i, sampling, rng) for i in episodes]
+    rows = [_choose(store, i, sampling, rng, None if pictures.preference is None
+                    else pictures.preference[i]) for i in episodes]
     T = max(len(row.times) for row in rows)
     times = np.stack([np.pad(row.times, (0, T - len(row.times))) for row in rows])
     valid = torch.arange(T) < torch.tensor([[len(row.times)] for row in rows])
@@ -230,8 +235,9 @@ class _Row:
     filled: bool  # whether the context pictures are without the robot
 
 
-def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Generator) -> _Row:
-    """Choose a piece of episode i, and its targets."""
+def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Generator,
+            preference: np.ndarray | None) -> _Row:
+    """Choose a piece of episode i, and its targets; preference: (levels, T), w of its frames."""
     available = length = int(store.lengths[i])
     if sampling.min_crop < 1:
         length = max(3, round(length * rng.uniform(sampling.min_crop, 1)))
@@ -239,6 +245,13 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
     if sampling.start_crop:
         late = min(int(rng.uniform(0, sampling.start_crop) * length), length - 3)
         start, length = start + late, length - late
+    if sampling.around and preference is not None:
+        labels = preference.argmax(1)
+        earliest, latest = labels.min() - sampling.around, labels.max() + sampling.around
+        start, stop = (int(rng.integers(low, max(low, high) + 1)) if rng.random() < 0.5 else usual
+                       for low, high, usual in ((0, earliest, 0), (
+                           min(latest, length - 1), length - 1, length - 1)))
+        length = stop - start + 1
     end, goal = length - 1, start + length - 1
     first, last = target_times(end, sampling.margin, sampling.forward)
     times = np.arange(first, last + 1)

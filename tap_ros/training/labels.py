@@ -21,6 +21,8 @@ from tap_ros.training.preference import describe, FEATURES, LEAST_FRAMES
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
 
+SIZE = 64  # px a side of the pictures that are described: whole ones, squeezed into a square
+USUAL_S = 8.0  # of a demonstration; in shorter ones all times below are shorter alike
 RATE = 10.0  # Hz, at most, of the frames that may be labels
 MOTION_RATE = 5.0  # Hz, about, of the frames between which motion is described
 AROUND_S = (-0.6, -0.3, 0.0, 0.3, 0.6)  # of the frames that are described together
@@ -48,6 +50,21 @@ class Film:
         return len(self.stamps)
 
     @property
+    def pace(self) -> float:
+        """The factor, up to 1, on all times, see USUAL_S."""
+        return _pace(self.stamps[-1])
+
+    @property
+    def tolerance(self) -> float:
+        """Within how many s a label is held to be right: a frame at least."""
+        return max(TOLERANCE_S * self.pace, self.step) + 1e-6
+
+    @property
+    def step(self) -> float:
+        """The longest time between two frames, in s."""
+        return float(np.diff(self.stamps).max(initial=0))
+
+    @property
     def slowest(self) -> int:
         """Return the frame between the first and the last one in which least moves."""
         speed = self.features[:, len(FEATURES) * (len(AROUND_S) // 2) + FEATURES.index('speed')]
@@ -67,29 +84,32 @@ def film_of(store: 'EpisodeStore', i: int) -> Film | None:
     return None if store.lengths[i] < LEAST_FRAMES else film(store.frames(i), store[i].stamps)
 
 
-def film(frames: np.ndarray, stamps_ns: np.ndarray) -> Film:
+def film(frames: np.ndarray, stamps_ns: np.ndarray, hidden: np.ndarray | None = None) -> Film:
     """
     Describe the frames of a demonstration.
 
     :param frames: (T, H, W, 3) uint8, at least LEAST_FRAMES.
     :param stamps_ns: (T,) ns, rising.
+    :param hidden: (T, H, W) bool, pixels that do not count, such as the robot's; None: none.
     :raises ConfigError: for fewer frames.
     """
-    step = _every(stamps_ns, RATE)
+    pace = _pace((stamps_ns[-1] - stamps_ns[0]) / 1e9)
+    step = _every(stamps_ns, RATE / pace)
     index = np.arange(0, len(frames), step)
     if len(index) < LEAST_FRAMES:
         index = np.arange(len(frames))
     stamps = (stamps_ns[index] - stamps_ns[0]) / 1e9
-    pictures = frames[index]
+    pictures, hidden = frames[index], None if hidden is None else hidden[index]
     # Motion between frames that are close is noise: every second, third... frame has its own.
-    step = min(_every(stamps_ns[index], MOTION_RATE), max(1, len(index) // LEAST_FRAMES))
+    step = min(_every(stamps_ns[index], MOTION_RATE / pace), max(1, len(index) // LEAST_FRAMES))
     found = np.empty((len(index), len(FEATURES)))
-    phases = [describe(pictures[k::step]) for k in range(step)]
+    phases = [describe(pictures[k::step], None if hidden is None else hidden[k::step])
+              for k in range(step)]
     for column in range(len(FEATURES)):
         found[:, column] = np.mean([
             np.interp(np.arange(len(index)), np.arange(k, len(index), step), phase[:, column])
             for k, phase in enumerate(phases)], 0)
-    near = np.abs(stamps[:, None, None] + np.array(AROUND_S)[:, None] - stamps).argmin(-1)
+    near = np.abs(stamps[:, None, None] + pace * np.array(AROUND_S)[:, None] - stamps).argmin(-1)
     grey = np.empty((len(index), phases[0].shape[1] - len(FEATURES)))
     for k, phase in enumerate(phases):
         grey[k::step] = phase[:, len(FEATURES):]
@@ -134,12 +154,12 @@ class MomentModel:
         self._scale[len(FEATURES) * len(AROUND_S):] *= grey
         inputs = [self._inputs(one) for one in films]
         self._weights = np.stack([
-            _most_likely(inputs, [_spread(one, second[m]) for one, second in zip(films, moments)])
+            _most_likely(inputs, [spread(one, second[m]) for one, second in zip(films, moments)])
             for m in range(len(moments[0]))], 1)
         gaps = np.diff(np.stack(moments), axis=1)  # (N, M - 1) s
         self._gap = gaps.mean(0)
         wide = gaps.var(0, ddof=1) if len(gaps) > 1 else np.full(len(self._gap), math.inf)
-        self._gap_deviation = np.sqrt(wide * (1 + 1 / len(gaps)) + LEAST_GAP_S ** 2)
+        self._gap_deviation = np.sqrt(wide * (1 + 1 / len(gaps)) + LEAST_GAP_S ** 2)  # XX
 
     def log_posterior(self, one: Film) -> np.ndarray:
         """Return log of the posterior of each mark and frame, (M, T), all marks in their order."""
@@ -169,7 +189,7 @@ def moments_of(one: Film, log_posterior: np.ndarray) -> tuple[np.ndarray, np.nda
 
     :param log_posterior: (M, T), as MomentModel returns it.
     """
-    near = np.abs(one.stamps[:, None] - one.stamps) <= TOLERANCE_S + 1e-6
+    near = np.abs(one.stamps[:, None] - one.stamps) <= one.tolerance
     mass = np.exp(log_posterior) @ near
     mass[:, [0, -1]] = 0
     best = mass.argmax(1)
@@ -187,10 +207,26 @@ def leave_one_out(films: Sequence[Film], moments: Sequence[np.ndarray],
     for i, (one, marks) in enumerate(zip(films, moments)):
         posterior = MomentModel([*films[:i], *films[i + 1:]], [*moments[:i], *moments[i + 1:]],
                                 grey).log_posterior(one)
-        near = np.abs(one.stamps - marks[:, None]) <= TOLERANCE_S + 1e-6  # (M, T)
+        near = np.abs(one.stamps - marks[:, None]) <= one.tolerance  # (M, T)
         worth += float(np.log((np.exp(posterior) * near).sum(1) + 1e-3).sum())
         found.append(moments_of(one, posterior)[0])
     return worth, found
+
+
+def fit(films: Sequence[Film],
+        moments: Sequence[np.ndarray]) -> tuple[MomentModel, list[np.ndarray]]:
+    """
+    Learn from marks; the grey picture gets the weight by which they find one another best.
+
+    :param films: that were marked; moments: of each (M,) s.
+    :return: the model, and of each what the others make of it, see Labels.left_out.
+    :raises ConfigError: see MomentModel.
+    """
+    if len(films) < 3:
+        return MomentModel(films, moments, GREY[1]), []
+    tried = {grey: leave_one_out(films, moments, grey) for grey in GREY}
+    grey = max(GREY, key=lambda grey: tried[grey][0])
+    return MomentModel(films, moments, grey), tried[grey][1]
 
 
 def label(films: Sequence[Film | None], marked: Mapping[int, np.ndarray],
@@ -198,23 +234,15 @@ def label(films: Sequence[Film | None], marked: Mapping[int, np.ndarray],
     """
     Find the moments of all demonstrations.
 
-    The grey picture gets the weight with which the marks are found best by one another.
-
     :param films: of each demonstration its Film; None of one that is too short to be marked.
     :param marked: {demonstration: moments (M,) s}.
     :param names: of the M marks.
     :raises ConfigError: see MomentModel; for as many names as there are not marks.
     """
-    chosen, given = [film for i in marked if (film := films[i])], list(marked.values())
-    if any(len(moments) != len(names) for moments in given):
+    if any(len(moments) != len(names) for moments in marked.values()):
         raise ConfigError(f'marks: expected {len(names)} in each demonstration, '
-                          f'{listing(names)}, got {sorted({*map(len, given)})}')
-    grey, left_out = GREY[1], []
-    if len(chosen) > 2:
-        tried = {grey: leave_one_out(chosen, given, grey) for grey in GREY}
-        grey = max(GREY, key=lambda grey: tried[grey][0])
-        left_out = tried[grey][1]
-    model = MomentModel(chosen, given, grey)
+                          f'{listing(names)}, got {sorted({*map(len, marked.values())})}')
+    model, left_out = fit([film for i in marked if (film := films[i])], list(marked.values()))
     found = Labels(tuple(names), [], [], left_out)
     for i, one in enumerate(films):
         moments, confidence = np.full((2, len(names)), math.nan)
@@ -227,16 +255,20 @@ def label(films: Sequence[Film | None], marked: Mapping[int, np.ndarray],
     return found
 
 
+def _pace(seconds: float) -> float:
+    return min(1.0, max(seconds, 1e-3) / USUAL_S)
+
+
 def _every(stamps_ns: np.ndarray, rate: float) -> int:
     """Return the stride with which frames come at about this rate."""
     seconds = (stamps_ns[-1] - stamps_ns[0]) / 1e9
     return max(1, round((len(stamps_ns) - 1) / max(seconds, 1e-9) / rate)) if seconds > 0 else 1
 
 
-def _spread(one: Film, second: float) -> np.ndarray:
+def spread(one: Film, second: float) -> np.ndarray:
     """Return the probability (T,) that a person means a frame by this mark."""
-    share = np.maximum(0, 1 - np.abs(one.stamps - one.stamps[one.nearest(second)])
-                       / (2 * SPREAD_S))
+    off = max(SPREAD_S * one.pace, one.step)
+    share = np.maximum(0, 1 - np.abs(one.stamps - one.stamps[one.nearest(second)]) / (2 * off))
     return share / share.sum()
 
 

@@ -43,6 +43,7 @@ import torch
 
 AVERAGE_DECAY = 0.999  # of the moving average that is shipped
 VIDEO_FRAMES = 16  # moments at which the recognition network sees the video; the paper: all
+AROUND = 2  # frames from a label that no start or goal is drawn from, beside the margin
 _SHOWN = 8  # episodes in a sample picture
 
 
@@ -135,8 +136,8 @@ def sampling_of(config: TrainingConfig) -> Sampling:
     whole = config.latent == 'vae' and config.posterior == 'video'
     return Sampling(
         config.margin, config.num_targets, config.min_crop, config.start_crop,
-        config.goal_picture, config.forward, config.only_fraction, int(config.gan),
-        VIDEO_FRAMES if whole else 0, config.fill_context)
+        config.goal_picture, config.forward, AROUND + config.margin if config.marks else 0,
+        config.only_fraction, int(config.gan), VIDEO_FRAMES if whole else 0, config.fill_context)
 
 
 def draw_batch(store: EpisodeStore, episodes: np.ndarray, config: TrainingConfig,

@@ -22,7 +22,8 @@ Precision = Literal['auto', 'float32', 'bfloat16']
 
 _RANGES = {
     'fraction': (1e-6, 1), 'beta': (1e-6, math.inf), 'progress_margin': (0, 0.95),
-    'recursion': (1, math.inf), 'kl_weight': (0, math.inf), 'free_nats': (0, math.inf),
+    'recursion': (1, math.inf), 'label_weight': (0, math.inf), 'kl_weight': (0, math.inf),
+    'free_nats': (0, math.inf),
     'kl_warmup': (0, 0.5), 'posterior_std': (0.01, 1), 'margin': (0, math.inf),
     'num_targets': (0, math.inf), 'min_crop': (1e-6, 1), 'start_crop': (0, 0.9),
     'brightness': (0, 0.9), 'fill_context': (0, 1), 'base_width': (1, math.inf),
@@ -38,10 +39,13 @@ class TrainingConfig(RunConfig):
     :param loss: 'fix' (Eq. 1), 'min' (Eq. 2) or 'genmin' (Eq. 5).
     :param selection: which error chooses the target of genmin: the 'absolute' one, divided by the
         preference over time, as in the paper; the one 'relative' to copying an input; the
-        absolute one with the preference over the 'progress' that pictures show (losses.py); or
-        the relative one with a preference for frames that are 'still', or learned from 'marks'.
-        fix with marks has its target at the frame of the largest preference.
+        absolute one with the preference over the 'progress' that pictures show (losses.py); the
+        relative one with a preference for frames that are 'still'; or the absolute one with
+        labels learned from 'marks' as a prior. fix with marks has its target at the label.
     :param marks: JSON file of demonstrations whose bottleneck a person has marked, see `mark`.
+        Start and goal are then drawn around the label.
+    :param label_weight: of log w(t) beside the l1 error, with selection marks; w(t) is how likely
+        a frame is the label. 0: any of the likeliest frames alike.
     :param gan: add the GAN's terms (Eq. 7).
     :param latent: 'vae' adds z (Eq. 9, with a GAN Eq. 10).
     :param fraction: share of the episode at which fix has its target.
@@ -98,6 +102,7 @@ class TrainingConfig(RunConfig):
     loss: Loss = 'genmin'
     selection: Selection = 'progress'
     marks: str = ''
+    label_weight: float = 0.01
     gan: bool = False
     latent: Latent = 'none'
     fraction: float = 0.5
@@ -159,6 +164,9 @@ class TrainingConfig(RunConfig):
         if (self.selection == 'marks') != bool(self.marks) or (self.marks and self.loss == 'min'):
             raise ConfigError('marks: they go with loss genmin or fix and selection marks; give '
                               'both options or none')
+        if self.marks and (self.min_crop < 1 or self.start_crop):
+            raise ConfigError('marks: start and goal are drawn around the label; leave min_crop '
+                              'and start_crop out, which draw them anywhere')
         if self.recursion > 1 and self.loss == 'fix':
             raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
                               'loss fix')

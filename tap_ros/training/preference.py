@@ -1,18 +1,12 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Time preferences w(t) of Eq. 5 that are not functions of the time alone.
+What the pictures of a demonstration show at each frame, and a preference w(t) by it (Eq. 5).
 
-One is learned from a few marked demonstrations: a softmax over the frames of a demonstration, of a
-linear function of ten features and of the picture, small and grey. The features are what every
-sequence of pictures has: where a frame is in time and on the way from start to goal, how fast the
-pictures change there, whether that slows down, and where. The other one, `still`, needs no marks.
+The features are what every sequence of pictures has: where a frame is in time and on the way from
+start to goal, how fast the pictures change there, whether that slows down, and where; and the
+picture, small and grey. Labels (labels.py) are learned from them; `still` needs no marks.
 """
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-import math
-from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -23,9 +17,6 @@ FEATURES = ('time', 'progress', 'distance to both', 'speed', 'distance to start'
             'motion to change')
 SMALL = 8  # pixels a side of the grey picture
 SIZE = len(FEATURES) + SMALL ** 2
-FLOOR = math.exp(-4)  # the least w of a frame, as a share of the largest of its demonstration
-RIDGE = 0.1  # price of the squared weights, in nats; features and pictures have variance 1
-SPREAD = (0.25, 0.5, 0.25)  # a mark is off by a frame as often as not
 LEAST_FRAMES = 3
 WINDOW = 4  # frames, before and after, between which speed changes
 BESIDE = 2  # frames, before and after, whose motion has one place
@@ -91,96 +82,6 @@ def still(features: np.ndarray) -> np.ndarray:
     return np.asarray(w / w.max())
 
 
-@dataclass(frozen=True)
-class Preference:
-    """
-    A learned w(t).
-
-    :param weights: (SIZE,), of the features with their mean taken off, in their deviations.
-    :param mean: (SIZE,), of the features in the demonstrations that were marked.
-    :param deviation: (SIZE,), likewise.
-    """
-
-    weights: np.ndarray
-    mean: np.ndarray
-    deviation: np.ndarray
-
-    def __call__(self, features: np.ndarray) -> np.ndarray:
-        """Return w (T,), FLOOR to 1, of the frames of a demonstration with features (T, SIZE)."""
-        logits = self._logits(features)
-        return np.maximum(np.exp(logits - logits.max()), FLOOR)
-
-    def best(self, features: np.ndarray) -> int:
-        """Return the frame of largest w, of those between start and goal."""
-        return 1 + int(self._logits(features)[1:-1].argmax())
-
-    def _logits(self, features: np.ndarray) -> np.ndarray:
-        """Return log w (T,), up to a constant."""
-        return np.asarray((features - self.mean) / self.deviation @ self.weights)
-
-    def to_json(self) -> dict[str, list[float]]:
-        """Return what JSON can hold; from_json reads it."""
-        return {name: values.tolist() for name, values in vars(self).items()}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Read what to_json has returned."""
-        return cls(**{name: np.array(each, float) for name, each in values.items()})
-
-
-def learn_preference(features: Sequence[np.ndarray], marks: Sequence[int]) -> Preference:
-    """
-    Learn w from marked demonstrations: the most likely one, with a ridge.
-
-    Minimises sum_n (-sum_k SPREAD_k log softmax(x_n a)_{m_n + k}) + RIDGE |a|^2, which is convex,
-    by Newton's method.
-
-    :param features: of N demonstrations, (T, SIZE) each.
-    :param marks: N, the frame that is marked in each.
-    :return: Preference.
-    :raises ConfigError: without marks.
-    """
-    from scipy.optimize import minimize  # takes a moment to import
-    if not marks:
-        raise ConfigError('marks: no demonstration is marked; mark at least one, better ten')
-    everything = np.concatenate(features)
-    mean, deviation = everything.mean(0), np.maximum(everything.std(0), 1e-6)
-    deviation[len(FEATURES):] = 1  # a pixel in which little happens says little
-    inputs = [(one - mean) / deviation for one in features]
-    wanted = [np.array(SPREAD) @ x[np.clip([mark - 1, mark, mark + 1], 0, len(x) - 1)]
-              for x, mark in zip(inputs, marks)]
-
-    def loss(a: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = RIDGE * a @ a, 2 * RIDGE * a
-        for x, target in zip(inputs, wanted):
-            share, log_sum = _softmax(x @ a)
-            value, slope = value + log_sum - target @ a, slope + share @ x - target
-        return float(value), slope
-
-    def curvature(a: np.ndarray) -> np.ndarray:
-        found = 2 * RIDGE * np.eye(len(a))
-        for x in inputs:
-            share, _ = _softmax(x @ a)
-            found = found + (x.T * share) @ x - np.outer(share @ x, share @ x)
-        return found
-
-    answer = minimize(loss, np.zeros(everything.shape[1]), jac=True, hess=curvature,
-                      method='trust-exact', options={'gtol': 1e-6})
-    return Preference(answer.x, mean, deviation)
-
-
-def leave_one_out(features: Sequence[np.ndarray], marks: Sequence[int]) -> np.ndarray:
-    """
-    Say whether the marks are enough: whether each is found by what is learned from the others.
-
-    :param features: as for learn_preference; marks: likewise, two at least.
-    :return: bool (N,), whether within a frame.
-    """
-    found = [learn_preference([*features[:i], *features[i + 1:]], [*marks[:i], *marks[i + 1:]]
-                              ).best(features[i]) for i in range(len(marks))]
-    return np.abs(np.array(found) - marks) <= 1
-
-
 def _centre(mass: np.ndarray) -> np.ndarray:
     """Return column and row of the centre of mass (H, W), 0 to 1; the middle of none."""
     total = mass.sum()
@@ -197,9 +98,3 @@ def _small(grey: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
     found = light / np.maximum(count, 1e-6)
     found = np.where(count > 0, found - found[count > 0].mean(), 0) if count.any() else 0 * found
     return np.asarray(found / max(found.std(), 1e-6))
-
-
-def _softmax(logits: np.ndarray) -> tuple[np.ndarray, float]:
-    largest = logits.max()
-    share = np.exp(logits - largest)
-    return share / share.sum(), float(largest + np.log(share.sum()))

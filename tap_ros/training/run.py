@@ -21,11 +21,19 @@ from tap_ros.base.errors import RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.bags import find_bags
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import read_marks
 from tap_ros.recording.reading import reading_of
 from tap_ros.recording.topic_choice import Bag
 from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.training.run_config import RunConfig
-from tap_ros.training.split import split_episodes, warn_if_few, with_masks
+from tap_ros.training.split import (
+    digests_of,
+    parse_held_out,
+    split_episodes,
+    tell,
+    warn_if_few,
+    with_masks,
+)
 from tap_ros.weights.devices import pick_device
 from tap_ros.weights.weights import save_weights
 import torch
@@ -88,16 +96,22 @@ class Run(Generic[Config]):
         self.store = open_recordings(
             bags_of(config), progress=self.progress, reading=reading_of(config),
             network=f'the {self.kind.replace("_", " ")}')
+        path = getattr(config, 'marks', '')
+        marked = read_marks(path, self.store).episodes if path else {}
         self.training, self.held_out = with_masks(self.store, split_episodes(
-            self.store, config.test_fraction, self._min_frames, config.held_out),
-            config.robot_mask)
+            self.store, config.test_fraction, self._min_frames, config.held_out, marked,
+            config.split), config.robot_mask)
         if not len(self.training):
             raise RecordingError('recordings: all that --held-out leaves is too short to '
                                  'train on; name others')
         if config.held_out and not len(self.held_out):
             raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
-                                 'by itself; name whole bags, not files of a split one')
+                                 'that is long enough by itself; name whole bags, not files of '
+                                 'a split one, or demonstrations: BAG:7')
+        print(tell(self.held_out, self.training, marked), file=sys.stderr)
         warn_if_few(self.held_out)
+        digests = digests_of(self.store)
+        self._held_out_digests = sorted({digests[i] for i in self.held_out})
         torch.manual_seed(config.seed)
         self._stack = ExitStack()
         self._stack.enter_context(_run_folder(config.out))
@@ -201,6 +215,7 @@ class Run(Generic[Config]):
             'data_hash': store.data_hash,
             'camera_size': list(store.camera_size) if store.camera_size else None,
             'episodes': len(self.training), 'held_out': len(self.held_out),
+            'held_out_digests': self._held_out_digests,
             'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, '
                        + (torch.cuda.get_device_name(self.device)
                           if self.device.type == 'cuda' else self.device.type),
@@ -215,7 +230,7 @@ def bags_of(config: RunConfig) -> list[Bag]:
     """Return the recordings, and of those held out what is not among them."""
     bags = find_bags(config.recordings)
     known = {file.resolve() for bag in bags for file in bag.files}
-    return bags + [bag for bag in find_bags(config.held_out)
+    return bags + [bag for bag in find_bags([parse_held_out(one)[0] for one in config.held_out])
                    if not {file.resolve() for file in bag.files} <= known]
 
 

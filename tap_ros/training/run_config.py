@@ -11,7 +11,7 @@ from tap_ros.base.errors import check_fields, ConfigError
 from tap_ros.base.options import default_text, Folder
 from tap_ros.images.robot_mask import RobotMask
 from tap_ros.recording.reading import ReadingOptions
-from tap_ros.training.split import TEST_FRACTION
+from tap_ros.training.split import Split, TEST_FRACTION
 from tyro import conf
 
 Name = Annotated[str, conf.arg(metavar='NAME', help_behavior_hint=default_text)]
@@ -36,8 +36,11 @@ class RunConfig(ReadingOptions):
     :param recipe: whose settings stand for those that are not given; without a name that of the
         task that the recordings name, else the one whose settings are shown here.
     :param out: the run's folder; if it holds a checkpoint, training goes on from there.
-    :param test_fraction: share of episodes held out, by seed.
-    :param held_out: recordings that are held out instead, among those to train on or beside them.
+    :param test_fraction: share of the scenes or demonstrations that is held out, unmarked first.
+    :param held_out: recordings that are held out instead, among those to train on or beside them,
+        or demonstrations of one by their numbers from 0: bags/mine:7 or bags/mine:3,10-19.
+    :param split: how the share is drawn: 'exact'; or 'crc32', as the shipped weights were, on
+        average only, and marked or not.
     :param seed: of the weights, batches and augmentation.
     :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
     :param threads: of the CPU; 0: what OMP_NUM_THREADS says, or one. More are faster on cores that
@@ -55,6 +58,7 @@ class RunConfig(ReadingOptions):
     out: Folder
     test_fraction: float = TEST_FRACTION
     held_out: HeldOut = ()
+    split: Split = 'exact'
     seed: int = 0
     device: str = 'auto'
     threads: int = 0

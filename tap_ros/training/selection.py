@@ -18,7 +18,8 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
     Compute E'_t of Eq. 5 for the configured method: E_t / w(t) in the paper (section 3.2).
 
     The preference w(t) is linear in forward prediction, else a bell. With w = 1 this is the
-    minimum over time (Eq. 2).
+    minimum over time (Eq. 2). Where w(t) is the likelihood of a label it is a prior of the
+    minimum, E_t - label_weight log w(t): the minimum chooses within what the label leaves open.
 
     :param error: (B, T), of the prediction against each target.
     :param copy_error: function without arguments that returns (B, C, T), the errors of the context
@@ -29,7 +30,10 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
         return error
     if config.selection in ('marks', 'still'):
         assert batch.preference is not None, 'made before the training'
-        return losses.relative_to_copying(error, copy_error(), batch.preference[:, 0])
+        w = batch.preference[:, 0]
+        if config.selection == 'marks':
+            return error - config.label_weight * w.log()
+        return losses.relative_to_copying(error, copy_error(), w)
     preference = (losses.linear_preference(batch.times, batch.end, config.beta) if config.forward
                   else losses.bell_preference(batch.times, batch.first, batch.last))
     if config.selection == 'relative':

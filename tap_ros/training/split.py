@@ -2,41 +2,133 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which episodes a network is trained on, and which it is measured on."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+import re
+from typing import Any, Literal, TYPE_CHECKING
 import warnings
 import zlib
 
 import numpy as np
-from tap_ros.base.errors import RecordingError, RecordingWarning
+from tap_ros.base.errors import ConfigError, RecordingError, RecordingWarning
+from tap_ros.base.text import escaped, listing
 from tap_ros.images.robot_mask import RobotMask
 from tap_ros.messages.topics import ROBOT_MASK
+from tap_ros.recording.marks import episodes_in
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
 
+Split = Literal['exact', 'crc32']
 TEST_FRACTION = 0.05  # held out unless a training says otherwise
 FEW = 5  # held-out episodes, of which scores say little
+Parts = tuple[np.ndarray, np.ndarray]  # training, held-out: int64 indices of episodes
 
 
 def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
-                   min_frames: int = 3,
-                   held_out: Sequence[str | Path] = ()) -> tuple[np.ndarray, np.ndarray]:
+                   min_frames: int = 3, held_out: Sequence[str | Path] = (),
+                   marked: Collection[int] = (), split: Split = 'exact') -> Parts:
     """
-    Split episodes into training and held-out ones, by task and seed, or by recording.
+    Split episodes into training and held-out ones, by scene, demonstration or recording.
 
-    Episodes of the same scene land on the same side, whichever recording they are in. Recordings
-    without seeds are split by position, and what several cameras saw of one demonstration stays
-    together. Of two scenes or more one is always held out, unless the share is 0.
+    Episodes of the same task and seed land on the same side, whichever recording they are in; so
+    does, without seeds, what several cameras saw of one demonstration. A fixed random order, by a
+    hash, says which are held out: where episodes are added, few move to the other side.
 
     :param store: the EpisodeStore.
-    :param test_fraction: the held-out share, 0..1.
+    :param test_fraction: the held-out share, 0..1, of the scenes or demonstrations; rounded, but
+        at least one and not all of them, unless it is 0.
     :param min_frames: episodes with fewer frames are left out.
-    :param held_out: files or folders: what is recorded there is held out, and nothing else.
+    :param held_out: see parse_held_out: what is named is held out, and nothing else.
+    :param marked: indices of episodes that are held out only when no others are left.
+    :param split: 'exact', or as the shipped weights were split: 'crc32', each by its own hash, so
+        that the share is met on average only, and marked ones are held out, too.
     :return: (training, held-out), int64 arrays of episode indices.
     :raises RecordingError: if no episode is long enough to train on.
+    :raises ConfigError: for a demonstration that there is not.
     """
+    usable = _usable(store, min_frames)
+    chosen = np.array(usable)
+    if held_out:
+        held = np.array(_named(store, usable, held_out))
+    elif split == 'crc32':
+        hashes = np.array([zlib.crc32(repr(key).encode()) for key in (
+            _scenes(store, usable) or _demonstrations(store, usable))])
+        held = hashes < test_fraction * 2 ** 32
+        if test_fraction and not held.any():
+            held = hashes == hashes.min()
+        if held.all():
+            held = hashes != hashes[0]
+    else:
+        everything = digests_of(store)
+        digests = [everything[i] for i in usable]
+        kept = {everything[i] for i in marked}
+        order = sorted(set(digests), key=lambda digest: (digest in kept, digest))
+        count = min(max(1, round(test_fraction * len(order))), len(order) - 1)
+        held = np.isin(digests, order[:count if test_fraction else 0])
+    return chosen[~held], chosen[held]
+
+
+def split_as_trained(store: 'EpisodeStore', training: Mapping[str, Any],
+                     test_fraction: float = TEST_FRACTION) -> Parts:
+    """
+    Split episodes as a training did: what it held out, whatever else the recordings hold.
+
+    :param training: what its weights file tells of it; {} of what was not trained.
+    :param test_fraction: of those that do not tell what they held out.
+    :return: as split_episodes; held out is what the training did not see.
+    """
+    settings = training.get('settings', {})
+    if 'held_out_digests' in training and not settings.get('held_out'):
+        usable = np.array(_usable(store))
+        held = np.isin(digests_of(store), training['held_out_digests'])[usable]
+        return usable[~held], usable[held]
+    return split_episodes(store, test_fraction, held_out=settings.get('held_out', ()),
+                          split='crc32' if training else 'exact')
+
+
+def digests_of(store: 'EpisodeStore') -> list[str]:
+    """Return a hash of the scene of each episode, else of when its demonstration was seen."""
+    episodes = range(len(store))
+    keys: list[Any] = list(_scenes(store, episodes))
+    if not keys:
+        first, times = _demonstrations(store, episodes), {}
+        count: Counter[tuple[int, int]] = Counter()
+        for i in dict.fromkeys(first):
+            span = store.seen(i)
+            times[i] = *span, count[span]  # clocks of several recordings may begin alike
+            count[span] += 1
+        keys = [times[i] for i in first]
+    return [hashlib.sha256(repr(key).encode()).hexdigest()[:16] for key in keys]
+
+
+def parse_held_out(text: str | Path) -> tuple[Path, list[tuple[int, int]]]:
+    """
+    Read what --held-out names: a file or folder, or demonstrations of it.
+
+    :param text: bags/mine, or with numbers from 0, as marks have them: bags/mine:7 or
+        bags/mine:3,10-19. A path that exists is one, whatever its name.
+    :return: the path; of demonstrations (first, last) of each range, none: all.
+    """
+    path, _, numbers = str(text).rpartition(':')
+    if not path or Path(text).exists() or not re.fullmatch(r'\d+(-\d+)?(,\d+(-\d+)?)*', numbers):
+        return Path(text), []
+    ends = [[int(end) for end in part.split('-')] for part in numbers.split(',')]
+    return Path(path), [(both[0], both[-1]) for both in ends]
+
+
+def tell(held_out: np.ndarray, training: np.ndarray, marked: Collection[int]) -> str:
+    """Return in words what a training holds out, with its numbers in the order of recordings."""
+    both = len(held_out) + len(training)
+    lost = len(set(marked) & set(held_out.tolist()))
+    marks = f', {lost or "none"} of {len(marked)} marked' if marked else ''
+    return f'held out: {len(held_out)} of {both} episodes{marks}: {listing(held_out, 20)}'
+
+
+def _usable(store: 'EpisodeStore', min_frames: int = 3) -> list[int]:
+    """Return the episodes that are long enough; a RecordingError says that there are none."""
     usable = [i for i in range(len(store)) if store.lengths[i] >= min_frames]
     if not usable:
         begins = np.array([store[i].stamps[0] for i in range(len(store))])
@@ -46,23 +138,34 @@ def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
             f'--gap {2 * np.median(pauses):.2g}')
         raise RecordingError(f'recordings: no episode has at least {min_frames} frames; '
                              f'record longer ones{together}')
-    chosen = np.array(usable)
-    if held_out:
-        places = {Path(path).resolve() for path in held_out}
-        held = np.array([not places.isdisjoint((file, *file.parents)) for file in (
-            store.source(i).resolve() for i in usable)])
-        return chosen[~held], chosen[held]
-    seeds = [store[i].seed for i in usable]
-    keys = ([(store[i].task, seed) for i, seed in zip(usable, seeds)] if len(set(seeds)) > 1
-            else _demonstrations(store, usable))
-    # A hash rather than a random draw: adding episodes moves none to the other side.
-    hashes = np.array([zlib.crc32(repr(key).encode()) for key in keys])
-    held = hashes < test_fraction * 2 ** 32
-    if test_fraction and not held.any():
-        held = hashes == hashes.min()
-    if held.all():
-        held = hashes != hashes[0]
-    return chosen[~held], chosen[held]
+    return usable
+
+
+def _named(store: 'EpisodeStore', usable: Sequence[int],
+           held_out: Iterable[str | Path]) -> list[bool]:
+    """Tell of each usable episode whether it is named, or another camera's picture of one."""
+    found: set[int] = set()
+    for text in held_out:
+        path, ranges = parse_held_out(text)
+        inside = episodes_in(store, path)
+        if not ranges or not inside:
+            found |= {*inside}
+        for first, last in ranges if inside else ():
+            if not first <= last < len(inside):
+                raise ConfigError(f'--held-out {escaped(text)}: there is no such demonstration; '
+                                  f'expected 0 to {len(inside) - 1}')
+            found |= {*inside[first:last + 1]}
+    if not any(parse_held_out(text)[1] for text in held_out):
+        return [i in found for i in usable]
+    together = _demonstrations(store, usable)
+    named = {first for i, first in zip(usable, together) if i in found}
+    return [first in named for first in together]
+
+
+def _scenes(store: 'EpisodeStore', episodes: Sequence[int]) -> list[tuple[str, int]]:
+    """Return the task and seed of each episode; [] where all seeds are the same."""
+    found = [(store[i].task, store[i].seed) for i in episodes]
+    return found if len({seed for _, seed in found}) > 1 else []
 
 
 def _demonstrations(store: 'EpisodeStore', episodes: Sequence[int]) -> list[int]:

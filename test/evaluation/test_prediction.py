@@ -17,6 +17,7 @@ from tap_ros.apps.evaluate_prediction import Options, run
 from tap_ros.base.errors import ConfigError, ImageError, RecordingWarning
 from tap_ros.base.options import parse
 from tap_ros.evaluation.bottleneck import bottleneck_scores
+from tap_ros.evaluation.hits import seconds_off
 from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
@@ -253,6 +254,9 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     assert 'positions: unknown' in shown and 'in 2 marked episodes' in shown
     scores = json.loads((tmp_path / 'out' / 'scores.json').read_text())['scores']
     hits = scores.pop('marks')
+    seconds, error = hits.pop('seconds'), hits.pop('error')
+    assert [one[0] for one in seconds] == sorted(one[0] for one in seconds) and error[0] > 0
+    assert f'error at the mark: too few to tell from copying; {error[0]:.2f} times' in shown
     assert set(hits) == {'prediction', 'middle', 'random'}
     assert hits['middle'][0][0] == hits['middle'][1][0] == 0.5
     assert hits['random'][0][0] == pytest.approx((3 / 7 + 1 / 7) / 2)
@@ -288,3 +292,21 @@ def test_differences_are_paired():
     assert gain(0.75 * baseline) == pytest.approx((0.25, 0.25, 0.25))
     _, low, high = gain(0.75 * baseline[::-1])
     assert high - low > 0.1
+
+
+def test_errors_at_the_mark_are_those_at_its_frame():
+    scores = evaluate(Pasting(), EPISODES, [0, 1], 'last', marks={1: [(2, 2)]})
+    copying = scores['copy-start']
+    assert np.isnan(copying.at_mark[0]) and np.isnan(copying.copying_at_mark[0])
+    frames = EPISODES[1].frames.astype(float)
+    assert copying.at_mark[1] == pytest.approx(
+        np.abs(frames[2] - frames[0]).mean() / 255, abs=1e-4)
+    assert copying.copying_at_mark[1] == pytest.approx(
+        min(np.abs(frames[2] - frames[end]).mean() for end in (0, -1)) / 255, abs=1e-4)
+    assert scores['prediction'].at_mark[1] != scores['prediction'].min_l1[1]
+
+
+def test_moments_are_off_by_the_seconds_to_the_nearest_mark():
+    stamps = np.arange(9) * 250_000_000
+    off = seconds_off(3 * [[(2, 3), (7, 7)]], 3 * [stamps], np.array([1, 3, 5]))
+    np.testing.assert_allclose(off, [0.25, 0, 0.5])

@@ -24,7 +24,7 @@ def test_no_demonstration_is_scored_by_weights_that_have_seen_it(tmp_path, monke
     def score(weights, bags):
         scored.append((seen[-1], bags[0].name))
         ours, copied = np.array([0.1, 0.3]), np.array([0.2, 0.4])
-        return None, EpisodeScores(ours, *[ours] * 7, copied)
+        return None, EpisodeScores(ours, *[ours] * 7, copied, ours, copied)
 
     monkeypatch.setattr(few, 'train', train)
     monkeypatch.setattr(few, 'score', score)

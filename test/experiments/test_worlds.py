@@ -37,7 +37,7 @@ def test_the_last_subgoal_is_where_the_way_turns_to_the_goal():
 
 
 def test_scores_are_shares_of_the_demonstrations_with_their_intervals():
-    shown = 40 * [command.Demonstration(REST, (7, 8))]
+    shown = 40 * [command.Demonstration(REST, (7, 8), np.arange(len(REST)) / 10)]
     rows = {row['method']: row for row in command.score([(shown[:12], 12 * [7])], shown)}
     assert rows['random']['hit']['value'] == pytest.approx(2 / 14)
     assert rows['slowest']['hit']['value'] == rows['10 marks']['near']['value'] == 1

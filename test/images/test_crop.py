@@ -63,10 +63,27 @@ def test_pictures_that_stream_in_are_cut_as_in_training():
     assert not trained('centre', 64).of((64, 64), 'start')  # cut already
     assert not trained('', 0, (64, 64)).of((480, 640), 'start')  # never were; it is refused later
     assert trained('8,8,32', 64, (64, 64)).of((64, 64), 'start') == Crop('8,8,32', 64)
+    # Cut already, but not scaled:
+    assert trained('80,0,480', 64).of((480, 480), 'start') == Crop(size=64)
+    assert trained('', 0, (64, 64)).of((100, 100), 'start') == Crop(size=64)
     # Pictures that were not scaled in training are, if the camera has more pixels now.
     assert trained('centre', 0, (64, 80)).of((480, 640), 'start') == Crop('centre', 64)
 
 
+
+
+def test_pictures_are_cut_without_being_made_smaller():
+    for crop, size, cut in (
+            (trained('centre', 64), (480, 640), Crop('centre')),
+            (trained('80,0,480', 64), (480, 640), Crop('80,0,480')),
+            (trained('80,0,480', 64), (480, 480), Crop()),
+            (trained('whole', 64), (480, 640), Crop('whole')),
+            (trained('', 0, (64, 64)), (256, 256), Crop()),
+            (trained('centre', 64), (64, 64), Crop()),
+            (trained('centre', 64), (48, 96), Crop('centre', 64))):  # it is made larger
+        assert crop.unscaled(size, 'start') == cut
+        assert crop.is_cut(cut.cut_size(size))
+    assert not trained('centre', 64).is_cut((480, 640)) and not trained('', 0).is_cut((32, 32))
     for crop, size in ((trained('80,0,480', 64), (240, 320)),
                        (trained('', 64, (96, 96)), (480, 640))):
         with pytest.raises(ImageError, match='start: '):

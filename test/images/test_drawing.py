@@ -26,6 +26,18 @@ def test_the_overlay_shows_each_map_where_it_is():
     assert (marked != shown).any()
 
 
+def test_maps_that_are_smaller_than_the_picture_are_shown_in_place():
+    picture, maps = np.full((96, 128, 3), 128, np.uint8), np.zeros((1, 16, 16))
+    maps[0, 3, 12] = 1
+    shown = overlay(picture, maps, 1, [[20, 80]])
+    assert shown.shape == picture.shape
+    strength = np.abs(overlay(picture, maps).astype(int) - 128).sum(-1)
+    v, u = np.unravel_index(strength.argmax(), strength.shape)
+    assert abs(v - 3.5 * 6) <= 3 and abs(u - 12.5 * 8) <= 4
+    marked = np.argwhere((shown != overlay(picture, maps)).any(-1))
+    assert np.ptp(marked, axis=0).min() > 3 * 8  # a mark is as large as on the maps
+
+
 def test_marks_outside_the_picture_are_not_seen_however_far():
     start, maps = np.full((16, 16, 3), 128, np.uint8), np.zeros((0, 16, 16))
     for pixel in ((20, 5), (5, -20), (-5.4e8, 5.4e8), (5, 3e38)):

@@ -25,6 +25,7 @@ from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.images.robot_mask import FreeView
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.predictor.requests import RequestReader
+from tap_ros.prediction.fullsize import fit
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import BagWriter
@@ -135,7 +136,7 @@ def seen_live(node, other, crop, sent, compressed, robot_mask):
                        'robot_mask': robot_mask}
     planner = PlannerInputs(node, params, lambda: crop, lambda name: None)
     reader = RequestReader(node, params, lambda name: None)
-    predictor = SimpleNamespace(camera_crop=crop, mode='bidirectional')
+    predictor = SimpleNamespace(camera_crop=crop, mode='bidirectional', full_size=True)
     publishers = {topic: other.create_publisher(
         type(message), topic, LATCHED if topic.startswith('goal') else STREAM)
         for _, topic, message in sent}
@@ -155,7 +156,9 @@ def seen_live(node, other, crop, sent, compressed, robot_mask):
         while due is not None:  # until the picture and a state after it have come
             seen, lacking = planner.look()
             if seen is not None and seen.stamp_ns == due:
-                found[due] = seen, reader.read(PredictSubgoal.Request(), predictor).request
+                request = reader.read(PredictSubgoal.Request(), predictor).request
+                assert np.array_equal(request.start, planner.sharp(seen)), 'not made smaller yet'
+                found[due] = seen, fit(request, crop)
                 due = None
             assert time.monotonic() < deadline, lacking
             time.sleep(0.01)

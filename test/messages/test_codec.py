@@ -3,6 +3,7 @@
 """Laws of messages: what goes in comes out, and what cannot be used is named."""
 
 import array
+from dataclasses import replace
 
 from builtin_interfaces.msg import Time
 import numpy as np
@@ -177,6 +178,20 @@ def test_a_subgoal_carries_the_stamp_and_frame_of_the_picture_and_may_have_no_ob
     assert decoded.mass.shape == (1,) and np.isnan(decoded.mass).all()
     decoded, = decode_subgoals(answer([subgoal(2, 1)]), (), SIZE)
     assert decoded.object_maps.shape == (0, *SIZE) and decoded.expected_pixels.shape == (0, 2)
+
+
+def test_the_picture_of_a_subgoal_may_be_larger_than_its_maps():
+    sent = replace(subgoal(0, 1), image=RNG.integers(0, 256, (40, 56, 3), np.uint8))
+    for size in (SIZE, None):
+        got, = decode_subgoals(answer([sent]), NAMES, size)
+        np.testing.assert_array_equal(got.image, sent.image)
+        np.testing.assert_array_equal(got.object_maps, sent.object_maps)
+    response = answer([sent])
+    response.subgoals[0].object_maps[1] = ros_topics.encode_subgoal(
+        replace(sent, object_maps=np.zeros((2, 16, 16), np.float32)), NAMES, to_stamp(1),
+        'eye').object_maps[1]
+    with pytest.raises(ImageError, match='object map of box: expected 8x8 .* got 16x16'):
+        decode_subgoals(response, NAMES)
 
 
 def test_answers_that_lack_something_are_refused_with_what():

@@ -16,7 +16,7 @@ import tap_ros
 from tap_ros.apps.cli import main
 from tap_ros.base.errors import ConfigError
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.predictor.node import OVERLAY_SCALE
+from tap_ros.nodes.predictor.node import OVERLAY_SIDE
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.topics import STREAM
@@ -57,7 +57,7 @@ def test_it_does_with_the_nodes_what_the_classes_do(loop):
         assert answer.expected_pixels == pytest.approx(wanted.expected_pixels, abs=0.01)
         by_topics, = client.predict()
         assert by_topics.expected_pixels == pytest.approx(answer.expected_pixels, abs=0.01)
-        for topic, side in ((loop.subgoal, 0), (loop.overlay, 64 * OVERLAY_SCALE)):
+        for topic, side in ((loop.subgoal, 0), (loop.overlay, OVERLAY_SIDE)):
             shown = topic.wait(10, lambda m: to_nanoseconds(m.header.stamp) == start.stamp_ns)
             assert not side or shown.width == shown.height == side
 

@@ -34,6 +34,7 @@ from tap_ros.apps.demo.film import (
 )
 from tap_ros.apps.demo.report import gains, results_table, shown, summary, write_report
 from tap_ros.apps.demo.watch import right_order, Watch
+from tap_ros.base.contract import CAMERA_SIZE
 from tap_ros.base.errors import TapError
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.recording.cache import open_recordings
@@ -191,7 +192,10 @@ def test_real_nodes_push_tracked_objects_of_two_tasks_with_one_start(tmp_path, c
     assert {path.name for path in (tmp_path / 'demo').iterdir()} == {
         'logs', 'recording', 'push2.webp', 'order2.webp', 'report.html', 'scenes.json'}
     with (tmp_path / 'demo' / 'recording' / 'recording_0.mcap').open('rb') as file:
-        bag = make_reader(file).get_summary()
+        reader = make_reader(file)
+        bag = reader.get_summary()
+        sharp = [message.data for _, _, message in reader.iter_messages(['/subgoal/image'])]
+    assert sharp and min(map(len, sharp)) > 3 * CAMERA_SIZE ** 2, 'as sharp as the camera'
     recorded = {bag.channels[each].topic for each in bag.statistics.channel_message_counts}
     wanted = set(re.findall(r'": "(/[a-z_/]+)', LAYOUT.read_text()))
     assert len(wanted) > 6 and wanted <= recorded, 'a panel would stay empty'

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """predict_subgoal and the states of its node, asked over DDS, with small untrained networks."""
 
+import cv2
 from lifecycle_msgs.msg import State, Transition
 from lively import lively_network
 import numpy as np
@@ -12,7 +13,9 @@ from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.messages.images import decode_image
+from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.predictor.node import PredictorNode
+from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.ros.calls import call
 from tap_ros.ros.topics import encode_image, encode_objects, LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights.weights import save_weights, stored_digest
@@ -140,6 +143,34 @@ def test_a_mode_is_that_of_the_weights_or_refused(services):
             (latent, WITH_GOAL | {'mode': 'backward'}, ['backward', 'bidirectional, forward'])):
         message = service.refusal(**fields)
         assert all(word in message for word in words), message
+
+
+def test_answers_are_as_large_as_the_pictures_and_those_of_the_predictor_itself(services, files):
+    service, sent = services['latent'], enlarged_pictures(96)
+    shown = {name: Newest(service.client_node, Image, f'/latent/subgoal/{name}', LATCHED)
+             for name in ('image', 'overlay')}
+    places = 3 * np.array([[[8, 9], [20, 21]], [[12, 13], [24, 17]]], np.float32)
+    response = service.answer(
+        **dict(zip(('start', 'goal'), (encode_image(one, STAMP, 'eye') for one in sent))),
+        **dict(zip(('start_objects', 'goal_objects'), map(objects, places))),
+        num_samples=2, recursion_depth=2, seed=4)
+    found = SubgoalPredictor.load(files['latent']).predict(*sent, *places, 2, 2, 4)
+    for one, direct in zip(decode_subgoals(response, NAMES), found, strict=True):
+        assert direct.image.shape == (96, 96, 3) and direct.object_maps.shape == (2, 32, 32)
+        for name in ('image', 'object_maps', 'expected_pixels'):
+            assert np.array_equal(getattr(one, name), getattr(direct, name))
+    shown['image'].wait(10, lambda m: m == response.subgoals[0].image)
+    shown['overlay'].wait(10, lambda m: m.width == m.height == 288)
+    # An answer with too many pixels for a message is of the size that the network sees.
+    large = dict(zip(('start', 'goal'), (
+        encode_image(one, STAMP, 'eye') for one in enlarged_pictures(960))))
+    assert [one.image.width for one in service.answer(**large).subgoals] == [960]
+    many = service.answer(num_samples=20, **large).subgoals
+    assert [(one.image.width, one.image.height) for one in many] == 20 * [(32, 32)]
+
+
+def enlarged_pictures(side):
+    return [cv2.resize(one, (side, side), interpolation=cv2.INTER_LINEAR) for one in PICTURES]
 
 
 def test_a_picture_whose_robot_mask_is_missing_is_refused(services):

@@ -27,7 +27,7 @@ class Rig:
     def __init__(self, node, world):
         self.world, self.arm, self.threads = world, Arm(node), set()
         self.client = tap_ros.Client(node=node)
-        self.planner = LocalNode(VisualMpcNode, num_threads=4)
+        self.planner = LocalNode(VisualMpcNode, num_threads=4, max_age=30.0)
         mpc, (seen, goal) = self.planner.node._mpc, first_pictures()
         plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels),
                         mpc.goal(goal.object_pixels))

@@ -43,7 +43,7 @@ def test_the_python_of_the_readme_runs_and_prints_what_it_says(tmp_path):
     assert run.returncode == 0, run.stderr
     said, = re.findall(r'print\(.*# (\[\[.*\]\])', block)
     assert run.stdout.split() == said.split()
-    assert cv2.imread(str(tmp_path / 'subgoal.png')).shape == (64, 64, 3)
+    assert cv2.imread(str(tmp_path / 'subgoal.png')).shape == (256, 256, 3)
 
 
 @pytest.mark.parametrize('page', PAGES, ids=of)

@@ -123,7 +123,7 @@ def test_what_is_imported_is_declared_and_what_is_required_is_imported():
                           'requirements-extras.txt', 'requirements-worlds.txt')
     assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt',
                           'requirements-dev.txt', 'requirements-worlds.txt')
-    used = {'tensorboard'}  # by way of torch.utils.tensorboard
+    used = {'av', 'tensorboard'}  # where it is there; by way of torch.utils.tensorboard
     for name in imported_packages('tap_ros', 'sim_bridge', 'experiments', 'test'):
         used |= distributions_of(name)
     for name in ('requirements', 'requirements-experiments', 'requirements-extras'):
@@ -154,5 +154,6 @@ def test_pip_brings_what_is_imported_and_the_pinned_versions_will_do(monkeypatch
     of_ros = {depend.name for depend in parse_package(str(ROOT)).exec_depends} | set(ROS_PACKAGES)
     imported = imported_packages('tap_ros', 'sim_bridge') - of_ros
     imported = {normalized(DISTRIBUTIONS.get(name, name)) for name in imported}
-    imported |= {'ray', 'tensorboard'}  # where it is there; by way of torch.utils.tensorboard
+    # Where they are there; by way of torch.utils.tensorboard.
+    imported |= {'av', 'ray', 'tensorboard'}
     assert set(bounds) | extras == imported - set(requirements('requirements-worlds.txt'))

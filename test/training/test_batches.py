@@ -11,6 +11,7 @@ from tap_ros.training.batches import (
     Augmentation,
     episode_order,
     make_batch,
+    Pictures,
     Sampling,
     target_times,
     uses_recorded_goal,
@@ -108,3 +109,22 @@ def test_augmentation_can_be_undone_and_is_the_same_for_all_pictures_of_an_episo
     assert augmentation.flip.any() and not augmentation.flip.all()
     changed = augmentation.apply(images[:, :1].expand(-1, 3, -1, -1, -1))
     assert changed[:, 0].equal(changed[:, 2])
+
+
+def test_start_and_goal_are_drawn_around_the_label(store):
+    labels = [int(n) // 2 for n in store.lengths]
+    w = [np.full((1, int(n)), 0.1, np.float32) for n in store.lengths]
+    for one, label in zip(w, labels):
+        one[0, label] = 1
+    episodes = np.arange(len(store))
+    rng, pictures = np.random.default_rng(0), Pictures(preference=w)
+    ends, whole = [], 0
+    for _ in range(20):
+        batch = make_batch(store, episodes, Sampling(around=2), rng, pictures)
+        labelled = (batch.preference[:, 0] == 1) & batch.valid
+        assert labelled.sum(1).tolist() == [1] * len(episodes), 'the label is a target'
+        times = batch.times[labelled]
+        assert (times >= 1).all() and (times < batch.end[:, 0]).all()
+        whole += int((batch.end[:, 0].numpy() == store.lengths - 1).sum())
+        ends.append(batch.end[:, 0].numpy())
+    assert 0.2 < whole / (20 * len(episodes)) < 0.9 and np.std(ends, 0).max() > 0

@@ -16,7 +16,7 @@ from tap_ros.apps.label_command import distinct_names
 from tap_ros.base.errors import ConfigError
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.marks import write_marks
+from tap_ros.recording.marks import read_marks, write_marks
 from tap_ros.recording.messages import decode
 from tap_ros.training.labels import film, label, MomentModel, moments_of
 
@@ -108,6 +108,11 @@ def test_the_command_labels_every_demonstration(tmp_path, shown, capsys):
     last = content['labels'][-1]
     assert last['seconds'] == pytest.approx(shown[-1][2][1], abs=0.5)
     assert last['stamp'] == pytest.approx(100 * COUNT + last['seconds'], abs=0.01)
+    found = read_marks(tmp_path / 'out' / 'labels.marks.json', store)
+    assert found.names == ('a', 'b') and len(found.episodes) == COUNT
+    for i, those in found.episodes.items():
+        seconds = [row['seconds'] for row in content['labels'][2 * i:2 * i + 2]]
+        assert np.allclose([first / 10 for first, _ in those], seconds, atol=0.051)
     assert (tmp_path / 'out' / 'labels.png').read_bytes()[:4] == b'\x89PNG'
     check_events(tmp_path / 'out' / 'squares.labels.mcap', content['labels'], store)
 

@@ -62,6 +62,8 @@ def test_each_loss_is_the_error_at_the_frame_that_it_chooses():
                             ({'loss': 'fix'}, torch.zeros(8, dtype=torch.int64)),  # Eq. 1
                             ({'loss': 'fix', 'selection': 'marks', 'marks': 'x'},
                              w[:, 0, :4].argmax(1)),
+                            ({'selection': 'marks', 'marks': 'x', 'label_weight': 0.1},
+                             (errors - 0.1 * w[:, 0, :4].log()).argmin(1)),
                             ({'selection': 'still'}, still),
                             ({'selection': 'absolute'}, preferred)):  # Eq. 5
         outcome = predictor_loss(showing(image), batch, replace(CONFIG, **settings))

@@ -1,21 +1,11 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of the preference that is learned from marks."""
-
-import json
+"""Laws of what pictures show at each frame."""
 
 import numpy as np
 import pytest
 from tap_ros.base.errors import ConfigError
-from tap_ros.training.preference import (
-    describe,
-    FEATURES,
-    FLOOR,
-    learn_preference,
-    leave_one_out,
-    Preference,
-    SIZE,
-)
+from tap_ros.training.preference import describe, FEATURES, SIZE
 
 CALM = FEATURES.index('speed')
 
@@ -32,29 +22,6 @@ def demonstration(seed):
     return frames, pause
 
 
-@pytest.fixture(scope='module')
-def marked():
-    drawn = [demonstration(seed) for seed in range(20)]
-    return [describe(frames) for frames, _ in drawn], [pause for _, pause in drawn]
-
-
-def test_a_handful_of_marks_finds_the_others(marked):
-    features, marks = marked
-    learned = learn_preference(features[:6], marks[:6])
-    off = [abs(learned.best(one) - mark) for one, mark in zip(features[6:], marks[6:])]
-    assert np.mean(np.array(off) <= 1) > 0.75
-    assert leave_one_out(features[:8], marks[:8]).mean() > 0.7
-    random = np.random.default_rng(0).integers(1, 23, 8).tolist()
-    assert leave_one_out(features[:8], random).mean() < 0.6
-    kept = Preference.from_json(json.loads(json.dumps(learned.to_json())))
-    for one in features:
-        w = kept(one)
-        assert w.shape == (24,) and w.max() == 1 and w.min() >= FLOOR
-        assert w[1:-1].argmax() + 1 == learned.best(one)
-    with pytest.raises(ConfigError, match='2 frames'):
-        describe(np.zeros((2, 8, 8, 3), np.uint8))
-
-
 def test_features_are_bounded_and_the_same_for_a_darker_camera():
     frames, pause = demonstration(5)
     found = describe(frames)
@@ -66,6 +33,8 @@ def test_features_are_bounded_and_the_same_for_a_darker_camera():
     assert abs(found[:, CALM].argmin() - pause) <= 1
     np.testing.assert_allclose(describe(frames // 2 + 10), found, atol=0.05)
     assert np.isfinite(describe(np.zeros((3, 8, 8, 3), np.uint8))).all()  # nothing ever moves
+    with pytest.raises(ConfigError, match='2 frames'):
+        describe(np.zeros((2, 8, 8, 3), np.uint8))
 
 
 def test_what_is_hidden_changes_nothing():

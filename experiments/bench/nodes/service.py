@@ -12,8 +12,10 @@ are answered, each with a queue of its own, spread over a few processes.
 from collections import Counter
 import contextlib
 from dataclasses import dataclass, field
+from functools import partial
 import multiprocessing
 import os
+from pathlib import Path
 from queue import SimpleQueue
 import signal
 import tempfile
@@ -29,13 +31,14 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.apps.node_processes import NodeProcesses
 from tap_ros.nodes.predictor.requests import MAX_TOGETHER as TOGETHER
-from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.protocol import Request
 from tap_ros.ros.calls import call, CallError
 from tap_ros.ros.client import Client
 from tap_ros.ros.requests import request_fields
 from tap_ros.ros.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights import DEFAULT_PREDICTOR
+from tap_ros.weights.weights import save_weights
 
 PIXELS = np.array([[[20, 21], [40, 33]], [[30, 12], [44, 50]]], np.float32)  # start, goal
 TIMEOUT = 20.0  # s; a call that takes longer counts as lost
@@ -85,7 +88,7 @@ class Options:
 def run(args):
     """Print the times of single calls, and what many clients get; return rows."""
     with tempfile.TemporaryDirectory() as folder, NodeProcesses(folder) as nodes:
-        nodes.start('predictor_node')
+        nodes.start('predictor_node', weights=cut_weights(folder))
         with streaming(args.rate) as stream:
             found = compare_latency(stream, args.rounds, args.calls)
             alone, service, inside = (1e3 * np.median(times) for times in (
@@ -97,6 +100,12 @@ def run(args):
                 f'the model alone, {alone:.1f} ms', 'at most 1.2 times the model alone and 1 ms',
                 service <= 1.2 * alone + 1, f'the model there {inside:.1f} ms, what else the node '
                 f'does {node - inside:.1f} ms, DDS and client {service - node:.1f} ms')])
+            small, large = (1e3 * np.median(times) for times in compare_sizes(
+                args.rounds, args.calls))
+            rows += show([Row(
+                'answer to pictures of 640x480, as large as their cut', f'{large:.1f} ms',
+                large / small, f'one to those of 64x64, {small:.1f} ms', 'at most 10 ms more',
+                large <= small + 10, 'messages of 2.5 MB there and back')])
             gain = TOGETHER * np.median(found.alone) / np.median(found.together)
             first = None
             for count in args.clients:
@@ -139,6 +148,21 @@ def compare_latency(stream, rounds, calls):
         values = {one.key: one.value for one in node.get(timeout=TIMEOUT).status[0].values}
     return Latency(*map(np.array, (alone, together, service, inside)),
                    float(values['predict_subgoal p50_ms']) / 1e3)
+
+
+def compare_sizes(rounds, calls):
+    """Time answers to pictures of the network's size and of 640x480 in turns; return both, s."""
+    sizes = [(64, 64), (480, 640)]
+    with Client() as client:
+        ask, found = make_client(client, SERVICE_QOS.depth), [[] for _ in sizes]
+        requests = [make_request(size) for size in sizes]
+        for _ in range(rounds):
+            for request, times in zip(requests, found):
+                times += timed(partial(call, ask, request, TIMEOUT), calls)
+        sides = [call(ask, request, TIMEOUT).subgoals[0].image.height for request in requests]
+    if sides != [64, 480]:
+        raise RuntimeError(f'answers have {sides} rows')
+    return found
 
 
 def timed(work, count, warm_up=5):
@@ -240,13 +264,23 @@ def publish(rate):
             time.sleep(1 / rate)
 
 
-def pictures():
-    """Return a start and a goal picture, uint8 (2, 64, 64, 3)."""
-    return np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
+def cut_weights(folder):
+    """Write the usual weights, as if of the middle of pictures of 640x480; return the file."""
+    network, _ = load_network(DEFAULT_PREDICTOR)
+    file = Path(folder, 'predictor.safetensors')
+    save_weights(file, network, 'predictor', network.config, {
+        'settings': {'crop': 'centre', 'size': 64}, 'camera_size': [480, 640]})
+    return file
 
 
-def make_request():
+def pictures(size=(64, 64)):
+    """Return a start and a goal picture, uint8 (2, *size, 3)."""
+    return np.random.default_rng(0).integers(0, 256, (2, *size, 3), np.uint8)
+
+
+def make_request(size=(64, 64)):
     """Return a request that has all it needs."""
-    start, goal = pictures()
+    (start, goal), places = pictures(size), PIXELS * (size[0] / 64) + (
+        (size[1] - size[0]) / 2, 0)  # in the middle of wide ones
     return PredictSubgoal.Request(**request_fields(
-        ('cup', 'box'), start=start, goal=goal, start_objects=PIXELS[0], goal_objects=PIXELS[1]))
+        ('cup', 'box'), start=start, goal=goal, start_objects=places[0], goal_objects=places[1]))

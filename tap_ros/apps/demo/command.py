@@ -36,7 +36,14 @@ from tap_ros.apps.demo.report import (
 )
 from tap_ros.apps.demo.watch import click, FOLLOWED_NO_MORE, Refused, right_order, Watch
 from tap_ros.apps.node_processes import errors_in, NodeProcesses
-from tap_ros.base.contract import DEFAULT_LOOK, LOOKS, ROBOT_MASKS, step_budget, TABLE
+from tap_ros.base.contract import (
+    CAMERA_SIZE,
+    DEFAULT_LOOK,
+    LOOKS,
+    ROBOT_MASKS,
+    step_budget,
+    TABLE,
+)
 from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.base.files import free_folder, write_atomically, write_rows
 from tap_ros.base.options import Folder, one_of
@@ -50,7 +57,6 @@ from tyro import conf
 FIRST_SCENE = 2_000_000  # seeds from here on are in no recording, no training and no table
 USUAL_TASKS = ('order2', 'order3')
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
-CAMERA_SIZE = 256  # px of the camera's pictures; networks are shown what they were trained on
 CALL_S, STEP_S = 60.0, 15.0  # that a call, and one step of a run, may take, far more than usual
 LOOK_S = 1.0  # between two looks whether all nodes run
 RESEND_S = 0.5  # sending pictures again takes time from plans
@@ -274,10 +280,10 @@ class NodeSet:
             return
         args, table, subgoals = self._args, self._args.world == TABLE, self._mode == 'subgoal'
         namespace = '' if subgoals else f'/{self._mode}'
-        world: dict[str, Any] = {'look': args.look, 'arm': args.arm, 'observer': True} if (
-            table) else {'world': args.world}
+        world: dict[str, Any] = {'world': args.world} if not table else {
+            'look': args.look, 'arm': args.arm, 'observer': True, 'image_size': CAMERA_SIZE}
         if args.tracked:
-            world |= {'objects': 'tracked', 'image_size': CAMERA_SIZE}
+            world['objects'] = 'tracked'
         self._nodes, self._task = ExitStack(), task
         self._client = self._nodes.enter_context(Client(namespace, CALL_S))
         self._watch = Watch(self._client, args.tracked,

@@ -123,8 +123,7 @@ class Watch:
         return Run(
             np.linalg.norm(positions - goal.positions, axis=-1), pictures,
             np.array([decode_objects(objects, self.truth)[1] for objects in truth]), heading,
-            [decode_subgoal(one, start.names, (one.image.height, one.image.width))
-             for one, in subgoals], result.message,
+            [decode_subgoal(one, start.names) for one, in subgoals], result.message,
             float(np.median([one.planning_ms for one in feedback] or [np.nan])))
 
     def _keep(self, topic: str, message: Any) -> None:

@@ -107,8 +107,7 @@ def picture_of(message: Any, kind: str) -> np.ndarray:
     """Return what is shown of a message: uint8 (H, W, 3); of a Subgoal with its maps."""
     if not isinstance(message, Subgoal):
         return decode_image(message, kind)
-    one = decode_subgoal(
-        message, message.object_names, (message.image.height, message.image.width))
+    one = decode_subgoal(message, message.object_names)
     return overlay(one.image, one.object_maps)
 
 

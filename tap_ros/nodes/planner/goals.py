@@ -3,6 +3,7 @@
 """Where a reach_goal request leads: its goal, sent along or by topic, and the subgoals."""
 
 from collections.abc import Callable
+from dataclasses import replace
 import time
 
 import numpy as np
@@ -10,6 +11,7 @@ from rclpy.node import Node
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_ros.base.errors import PlanningError
+from tap_ros.images.pixels import resize_image, resize_pixels
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.objects import check_found, match_objects
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
@@ -127,18 +129,24 @@ class GoalSource:
         """
         Return the Subgoals of all samples, their objects in the order in which they are seen.
 
-        Pictures are sent cut and scaled as the planner sees them: so the maps of the answer are in
-        its pixels, whatever the predictor makes of a camera's.
+        Pictures are sent cut as the planner sees them: so the maps of the answer are in its
+        pixels, whatever the predictor makes of a camera's. They are as sharp as the camera's, for
+        people; what comes back is made as small as what the planner sees.
         """
-        header = to_stamp(seen.stamp_ns), self._inputs.frame_id
+        header, size = (to_stamp(seen.stamp_ns), self._inputs.frame_id), seen.image.shape[:2]
+        pictures = self._inputs.sharp(seen), self._inputs.part(goal, 'goal')
         start_objects, goal_objects = (encode_objects(
-            seen.names, pixels, None, *header, ObjectStates.SOURCE_TRACKED)
-            for pixels in (seen.pixels, goal_pixels))
+            seen.names, resize_pixels(pixels, size, picture.shape[:2]), None, *header,
+            ObjectStates.SOURCE_TRACKED)
+            for pixels, picture in zip((seen.pixels, goal_pixels), pictures))
         response = self._client.call(
             'predict', self._params['predictor_timeout'], go_on,
-            start=encode_image(seen.image, *header),
-            goal=encode_image(self._inputs.cut(goal, 'goal'), *header),
+            start=encode_image(pictures[0], *header), goal=encode_image(pictures[1], *header),
             start_objects=start_objects, goal_objects=goal_objects,
             num_samples=self._request.num_samples, seed=self._request.seed,
             recursion_depth=self._request.recursion_depth)
-        return decode_subgoals(response, seen.names, seen.image.shape[:2])
+        return [replace(
+            one, image=resize_image(one.image, size),
+            expected_pixels=resize_pixels(one.expected_pixels, one.image.shape[:2], size))
+            if one.image.shape[:2] != size else one
+            for one in decode_subgoals(response, seen.names, size)]

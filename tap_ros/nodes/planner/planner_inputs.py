@@ -74,6 +74,7 @@ class PlannerInputs:
         """Begin a goal: only what is received from this monotonic time on is seen."""
         self._since, self.frame_id = since, ''
         self._seen: Observation | None = None
+        self._shown: np.ndarray | None = None  # its picture, of the camera's size
         self._publishers = publishers_of(self._node, *self._names.values())
 
     def look(self) -> tuple[Observation | None, str]:
@@ -124,6 +125,17 @@ class PlannerInputs:
         """
         crop = self._crop()
         return check_image(crop.of(picture.shape[:2], name).image(picture), name, crop.size)
+
+    def sharp(self, seen: Observation) -> np.ndarray:
+        """Return the part of the camera's picture that an Observation shows, see `part`."""
+        if self._shown is None or self._seen is None or self._seen.image is not seen.image:
+            return seen.image
+        return self.part(self._shown, self._names['image'])
+
+    def part(self, picture: np.ndarray, name: str) -> np.ndarray:
+        """Return what `cut` does, not made smaller where it is a square of the picture."""
+        part = self._crop().unscaled(picture.shape[:2], name).image(picture)
+        return part if part.shape[0] == part.shape[1] else self.cut(picture, name)
 
     def decode_positions(
             self, message: ObjectStates, name: str,
@@ -188,6 +200,7 @@ class PlannerInputs:
             order = [names.index(name) for name in self._seen.names]
             names, pixels = self._seen.names, pixels[order]
             states = tuple(states[k] for k in order) if states else ()
+        self._shown = picture
         return Observation(self.cut(picture, name), gripper, names, pixels, moment.stamp_ns,
                            states=states)
 

@@ -33,7 +33,7 @@ from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 Send = Callable[[PredictSubgoal.Response], object]
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 
-OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
+OVERLAY_SIDE = 256  # pixels that subgoal/overlay has a side, about, where the picture has fewer
 SHOW_PERIOD = 0.1  # s between two checks for a subgoal to publish
 
 
@@ -122,7 +122,8 @@ class PredictorNode(LifecycleBase):
         try:
             self._subgoal.publish(message)
             self._picture.publish(message.image)
-            picture = overlay(request.start, subgoal.object_maps, OVERLAY_SCALE,
+            scale = max(1, round(OVERLAY_SIDE / max(request.start.shape)))
+            picture = overlay(request.start, subgoal.object_maps, scale,
                               request.start_pixels, request.goal_pixels)
             self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
         except Exception as error:

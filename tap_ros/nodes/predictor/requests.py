@@ -15,10 +15,9 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.base.contract import CAMERA_FRAME, MODES
+from tap_ros.base.contract import CAMERA_FRAME, MAX_PICTURE_BYTES, MODES
 from tap_ros.base.errors import ConfigError, ImageError, TapError
 from tap_ros.base.text import escaped, listing
-from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.objects import check_found, decode_cut_objects, match_objects
@@ -109,8 +108,9 @@ class RequestReader:
         num_samples, depth = request.num_samples or 1, request.recursion_depth or 1
         check_work(num_samples, depth, 0)
         check_mode(request, predictor.mode)
-        start = self._view('start', request.start, request.start_objects, predictor.camera_crop)
-        goal = (self._view('goal', request.goal, request.goal_objects, predictor.camera_crop)
+        pixels = MAX_PICTURE_BYTES // (3 * num_samples * depth)
+        start = self._view('start', request.start, request.start_objects, predictor, pixels)
+        goal = (self._view('goal', request.goal, request.goal_objects, predictor, pixels)
                 if predictor.mode == 'bidirectional' else None)
         no_maps = '; '.join(view.no_objects for view in (start, goal) if view and view.no_objects)
         names = () if no_maps else start.names
@@ -124,9 +124,14 @@ class RequestReader:
                 goal_pixels, num_samples, depth, request.seed),
             names, no_maps, start.header.stamp, start.header.frame_id or CAMERA_FRAME)
 
-    def _view(self, name: str, image: Image, objects: ObjectStates,
-              crop: TrainedCrop) -> RequestedView:
-        """Decode a picture and its objects; take the newest ones if it was left empty."""
+    def _view(self, name: str, image: Image, objects: ObjectStates, predictor: Predictor,
+              most_pixels: int) -> RequestedView:
+        """
+        Decode a picture and its objects; take the newest ones if it was left empty.
+
+        It is made smaller here if the answer would have more pixels, or the predictor takes no
+        larger ones.
+        """
         no_objects = '' if objects.objects else f'{name}_objects are empty'
         found = self._find(name) if is_empty(image) else {'image': image}
         if is_empty(image) and not objects.objects:
@@ -138,11 +143,16 @@ class RequestReader:
             picture = decode_image(found['image'], name)
             if 'mask' in found:
                 picture = self._robot.fill_goal(picture, found['mask'])
-        cut = crop.of(picture.shape[:2], name)
+        crop, size = predictor.camera_crop, picture.shape[:2]
+        cut = crop.of(size, name)
+        if getattr(predictor, 'full_size', False):
+            full = crop.unscaled(size, name)
+            cut = full if math.prod(full.cut_size(size)) <= most_pixels else cut
+        picture = cut.image(picture)
+        check_image(picture, name, None if crop.is_cut(picture.shape[:2]) else crop.size)
         check_found(objects, f'{name}_objects')
         return RequestedView(
-            check_image(cut.image(picture), name, crop.size),
-            *decode_cut_objects(objects, f'{name}_objects', picture.shape[:2], cut),
+            picture, *decode_cut_objects(objects, f'{name}_objects', size, cut),
             no_objects, found['image'].header)
 
     def _find(self, name: str) -> dict[str, Any]:
@@ -199,6 +209,8 @@ def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],
     if len(subgoals) < wanted * task.request.recursion_depth:
         message += (f'; one sample instead of {wanted}, as these weights have no latent variable '
                     'and all samples would be the same')
+    message += ''.join(f'; {warning}' for warning in {
+        subgoal.warning: None for subgoal in subgoals if subgoal.warning})
     return PredictSubgoal.Response(
         success=True, message=message, model_time_ms=elapsed_ms,
         subgoals=[encode_subgoal(subgoal, task.names, task.stamp, task.frame_id)

@@ -38,6 +38,7 @@ from tap_ros.recording.formats.pictures import (
     Skipped,
     write_bag,
 )
+from tap_ros.recording.formats.videos import at_rate
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.trust import Budget, MOST_BYTES, MOST_FRAMES
 
@@ -68,11 +69,15 @@ def run(args: Options) -> None:
                     arrays = dict(_arrays(root, skipped, Budget(file.stat().st_size)))
                     for name, number in zip(_chosen(arrays, args.camera), numbers):
                         with skipped.errors_of('array', f'{escaped(name)} of {place}'):
+                            seconds: list[float] = []
+                            found = ((row / (args.fps or FPS), each)
+                                     for row, each in enumerate(arrays[name]()))
                             frames, rows = decoded(
-                                arrays[name](), lambda each: args.cut.image(_picture(each)),
-                                skipped, f'episode {number}')
+                                at_rate(found, args.rate, seconds),
+                                lambda each: args.cut.image(_picture(each)), skipped,
+                                f'episode {number}')
                             yield make_episode(
-                                frames, rows / (args.fps or FPS), task=args.task, seed=number)
+                                frames, np.array(seconds)[rows], task=args.task, seed=number)
 
     print(write_bag(args, episodes(), skipped))
 

@@ -51,9 +51,9 @@ from tap_ros.recording.formats.pictures import (
     MOST_CHARACTERS,
     Skipped,
     Target,
-    video_frames,
     write_bag,
 )
+from tap_ros.recording.formats.videos import at_rate, video_frames
 from tap_ros.recording.marks import beside, write_marks
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.trust import inside, parse_json, read_bytes
@@ -85,7 +85,8 @@ def run(args: Options) -> None:
     :raises TapError: for a set that cannot be read, and a folder that holds something.
     """
     data = DataSet(args.path, args.camera)
-    said = write_bag(args, data.episodes(args.cut), data.skipped, len(data.rows))
+    said = write_bag(args, data.episodes(args.cut, args.rate), data.skipped, len(data.rows),
+                     jpeg=data.is_video and not args.size)
     print(f'{said} of {escaped(data.camera)}')
     if any(data.marks):
         path = beside(args.out)
@@ -147,23 +148,25 @@ class DataSet:
         if self._objects:
             taken.add(OBJECTS)
         self.unused = sorted(self.features.keys() - taken)
-        self._starts = self._find_starts() if self._is_video else {}
+        self._starts = self._find_starts() if self.is_video else {}
         self.rows = [row for row in self.rows
-                     if row['episode_index'] in self._starts or not self._is_video]
+                     if row['episode_index'] in self._starts or not self.is_video]
         self._video: Video | None = None
 
-    def episodes(self, crop: Crop) -> Iterator[Episode]:
+    def episodes(self, crop: Crop, rate: float = 0.0) -> Iterator[Episode]:
         """
         Yield the episodes, without the rows whose pictures cannot be used.
 
         :param crop: Crop of the pictures.
+        :param rate: rows a second that are taken, about; 0: all.
         """
         for row in self.rows:
             with self.skipped.errors_of('episode', escaped(row['episode_index'], 20)):
-                yield self._episode(row, crop)
+                yield self._episode(row, crop, rate)
 
     @property
-    def _is_video(self) -> bool:
+    def is_video(self) -> bool:
+        """Whether the pictures are in videos, not in files."""
         return bool(self.features[self.camera]['dtype'] == 'video')
 
     def _flat_names(self, key: str) -> list[Any]:
@@ -267,10 +270,16 @@ class DataSet:
                           'other', RecordingWarning, stacklevel=3)
         return starts
 
-    def _episode(self, row: dict[str, Any], crop: Crop) -> Episode:
+    def _episode(self, row: dict[str, Any], crop: Crop, rate: float) -> Episode:
         """Return the episode of a row."""
         part, size = self._rows_of(row), (1, 1)
-        cells, show = self._filmed(row, part) if self._is_video else (
+        seconds = np.arange(len(part)) / self.fps
+        told = np.array(listed(part['timestamp']), float).ravel()
+        if (np.abs(told - told[0] - seconds) > 0.5 / self.fps).any() and (np.diff(told) > 0).all():
+            seconds = told - told[0]  # another rate than that of the description
+        taken = list(at_rate(zip(seconds.tolist(), range(len(part))), rate, []))
+        whole, part, seconds = len(taken) == len(part), part.take(taken), seconds[taken]
+        cells, show = self._filmed(row, part) if self.is_video else (
             part[self.camera],  # rows may share what is in the file once
             lambda cell: decompress(self._file_of(cell.as_py()), 'unknown'))
 
@@ -290,18 +299,15 @@ class DataSet:
         if self._objects:
             pixels = numbers(OBJECTS, 2 * len(self._objects)).reshape(T, -1, 2)
             known['object_pixels'] = crop.pixels(pixels, size)
-        if self._is_ours(ACTION):  # nothing leads on from the last frame
+        if self._is_ours(ACTION) and whole:  # nothing leads on from the last frame
             known['actions'] = np.append(numbers(ACTION, 4)[:-1], np.zeros((1, 4), np.float32), 0)
         if self._is_ours(STATE):
             known['grippers'] = numbers(STATE, 4)
-        outcome, seconds = row.get(OUTCOME, ''), np.arange(len(part)) / self.fps
+        outcome = row.get(OUTCOME, '')
         self.marks.append([])
         if SUBTASK in self.features:
             ends = np.flatnonzero(np.diff(np.ravel(listed(part[SUBTASK]))[kept]))
             self.marks[-1] = ends[ends > 0].tolist()
-        told = np.array(listed(part['timestamp']), float).ravel()
-        if (np.abs(told - told[0] - seconds) > 0.5 / self.fps).any() and (np.diff(told) > 0).all():
-            seconds = told  # another rate than that of the description
         return make_episode(
             frames, seconds[kept], self._objects,
             task=row['tasks'], seed=int(row.get(SEED, row['episode_index'])),
@@ -320,12 +326,12 @@ class DataSet:
         times = self._starts[row['episode_index']] + np.array(
             listed(part['timestamp']), float).ravel()
         if self._video is None or self._video.path != path or self._video.now[0] > times[0]:
-            self._video = Video(path, video_frames(inside(self.folder, path)))
+            self._video = Video(path, video_frames(inside(self.folder, path)), 1 / self.fps)
         video = self._video
 
         def show(at: float) -> np.ndarray:
             seen, picture = video.at(at)
-            if not abs(seen - at) <= 1 / self.fps:  # nor for NaN
+            if picture is None or not abs(seen - at) <= 1 / self.fps:  # nor for NaN
                 raise RecordingError(f'{escaped(path)} has no frame at {at:.3f} s')
             return picture
         return times.tolist(), show

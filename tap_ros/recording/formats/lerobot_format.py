@@ -13,6 +13,7 @@ from tap_ros.base.errors import RecordingError
 from tap_ros.base.text import escaped
 from tap_ros.recording.bags import what_else
 from tap_ros.recording.formats.pictures import DAMAGE
+from tap_ros.recording.formats.videos import Show
 from tap_ros.recording.trust import Budget, inside
 
 INFO = 'meta/info.json'
@@ -85,18 +86,26 @@ class Video:
 
     :param path: its name in the set.
     :param frames: as video_frames yields them.
-    :ivar now: (seconds, picture) that was taken last.
+    :param period: s; a frame may be so far from the time for which it is asked.
+    :ivar now: (seconds, picture or None) of the frame that was taken last.
     """
 
-    def __init__(self, path: Path, frames: Iterator[tuple[float, np.ndarray]]) -> None:
-        self.path, self._frames = path, frames
+    def __init__(self, path: Path, frames: Iterator[tuple[float, Show]], period: float) -> None:
+        self.path, self._frames, self._period = path, frames, period
         first = next(frames, None)
         if not first:
             raise RecordingError(f'{escaped(path)} has no frame')
-        self.now, self._next = first, next(frames, None)
+        self.now: tuple[float, np.ndarray | None] = first[0], first[1]()
+        self._next = next(frames, None)
 
-    def at(self, seconds: float) -> tuple[float, np.ndarray]:
-        """Return the frame nearest to a time, of those not before the last one."""
+    def at(self, seconds: float) -> tuple[float, np.ndarray | None]:
+        """
+        Return the frame nearest to a time, of those not before the last one.
+
+        :return: its time, and the picture; None of one more than a period away.
+        """
         while self._next and abs(self._next[0] - seconds) <= abs(self.now[0] - seconds):
-            self.now, self._next = self._next, next(self._frames, None)
+            at, show = self._next  # it is shown, if at all, before the next one is asked for
+            self.now = at, show() if at >= seconds - 1.5 * self._period else None
+            self._next = next(self._frames, None)
         return self.now

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
-import os
 from pathlib import Path
 import re
 from typing import Annotated, Any
@@ -20,15 +19,15 @@ import warnings
 
 import cv2
 import numpy as np
-from tap_ros.base.contract import MAX_PICTURE_BYTES
 from tap_ros.base.errors import ConfigError, ImageError, RecordingError, RecordingWarning
 from tap_ros.base.files import only_writer
 from tap_ros.base.options import default_text, Folder
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
-from tap_ros.recording.bags import VIDEOS, what_else, what_is
+from tap_ros.recording.bags import VIDEOS, what_is
 from tap_ros.recording.defects import Defect, describe
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.formats.videos import at_rate, video_frames
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading import Part
 from tap_ros.recording.trust import inside, MOST_BYTES, MOST_FRAMES, regular
@@ -42,7 +41,6 @@ DAMAGE = (ImageError, RecordingError, OSError, LookupError, TypeError, ValueErro
           ArithmeticError, MemoryError, RuntimeError, cv2.error)  # of files made by others
 _MOST_SECONDS = 86400  # of a demonstration
 MOST_CHARACTERS = 1000  # of a task
-_FORMATS = 'mov,matroska,avi,h264'  # of videos, as FFmpeg calls them: none that names other files
 EPISODE_SPACING_NS = 60 * 10**9  # between the end of an episode and the start of the next
 Paths = Annotated[conf.Positional[tuple[str, ...]], conf.arg(
     metavar='PATH [PATH ...]', help_behavior_hint='(required)')]
@@ -55,12 +53,20 @@ class Target:
 
     :param out: folder of the bag; must not exist, or be empty.
     :param crop: square part of the pictures that is kept, as in train --help.
-    :param size: pixels a side that they are scaled to; 0: not scaled.
+    :param size: pixels a side that they are scaled to; 0: not scaled, and those of videos are kept
+        as JPEG.
+    :param rate: pictures a second, about; 0: all of them.
     """
 
     out: Folder
     crop: Part = ''
     size: int = 0
+    rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a rate that no camera has."""
+        if not 0 <= self.rate <= 1000:
+            raise ConfigError(f'--rate {self.rate}: expected more than 0, to 1000, or 0')
 
     @property
     def cut(self) -> Crop:
@@ -87,7 +93,8 @@ class Options(Target):
     task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
 
     def __post_init__(self) -> None:
-        """Refuse a rate that no camera has."""
+        """Refuse rates that no camera has."""
+        super().__post_init__()
         if not 0 <= self.fps <= 1000:
             raise ConfigError(f'--fps {self.fps}: expected more than 0, to 1000, or 0')
 
@@ -107,22 +114,15 @@ def run(args: Options) -> None:
         for number, path in enumerate(sorted(files, key=natural)):
             with skipped.errors_of('video', escaped(path.name)):
                 seconds: list[float] = []
+                found = ((row / args.fps if args.fps else at, show)
+                         for row, (at, show) in enumerate(video_frames(path)))
                 frames, rows = decoded(
-                    _noting(seconds, video_frames(path)), args.cut.image, skipped,
-                    escaped(path.name))
+                    at_rate(found, args.rate, seconds), lambda show: args.cut.image(show()),
+                    skipped, escaped(path.name))
                 yield make_episode(
-                    frames, rows / args.fps if args.fps else np.array(seconds)[rows],
-                    task=args.task, seed=number)
+                    frames, np.array(seconds)[rows], task=args.task, seed=number)
 
-    print(write_bag(args, episodes(), skipped, len(files)))
-
-
-def _noting(seconds: list[float],
-            frames: Iterable[tuple[float, np.ndarray]]) -> Iterator[np.ndarray]:
-    """Yield the pictures of a video; their times are appended."""
-    for at, frame in frames:
-        seconds.append(at)
-        yield frame
+    print(write_bag(args, episodes(), skipped, len(files), jpeg=not args.size))
 
 
 def find_files(paths: Iterable[str | Path], patterns: Iterable[str],
@@ -189,8 +189,8 @@ class Skipped:
         """
         lines = [f'{escaped(out)}: {line}' for line in describe(self._defects)]
         if is_empty:
-            raise RecordingError(
-                lines[0] if lines else f'{escaped(out)}: there is no episode to import')
+            raise RecordingError('; '.join(lines[:3]).replace(f'; {escaped(out)}: ', '; ') or
+                                 f'{escaped(out)}: there is no episode to import')
         for line in lines:
             warnings.warn(line, RecordingWarning, stacklevel=3)
 
@@ -259,7 +259,7 @@ def _is_free(folder: Path) -> bool:
 
 
 def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
-              count: int | None = None) -> str:
+              count: int | None = None, jpeg: bool = False) -> str:
     """
     Write episodes one after the other, in files of EPISODES_PER_FILE: all of them, or nothing.
 
@@ -267,6 +267,8 @@ def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
     :param episodes: iterable of Episode, whose stamps count from anywhere.
     :param skipped: what could not be used of them, when they have been read.
     :param count: how many there are, to show progress.
+    :param jpeg: keep pictures as JPEG, a sixth of the bytes and the time; of videos, which have
+        lost more.
     :return: a line that says what was written.
     :raises ConfigError: for a folder that holds something.
     :raises RecordingError: when there is no episode.
@@ -284,7 +286,7 @@ def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
                     if done % EPISODES_PER_FILE == 0:
                         stack.close()
                         name = f'{out.resolve().name}_{done // EPISODES_PER_FILE}.mcap'
-                        writer = stack.enter_context(EpisodeWriter(out / name))
+                        writer = stack.enter_context(EpisodeWriter(out / name, jpeg=jpeg))
                     stamps = episode.stamps - episode.stamps[0] + begin
                     writer.write(replace(episode, stamps=stamps))
                     begin, size = int(stamps[-1]) + EPISODE_SPACING_NS, episode.frames.shape[1:3]
@@ -298,43 +300,3 @@ def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
             if is_new and not whole:
                 out.rmdir()
     return f'{escaped(out)}: {done} episodes, {frames} frames of {size[1]}x{size[0]} pixels'
-
-
-def video_frames(path: Path) -> Iterator[tuple[float, np.ndarray]]:
-    """
-    Decode a video: by OpenCV, or by PyAV where that cannot and PyAV is installed.
-
-    :param path: of the file.
-    :return: iterator over (seconds from the first frame, uint8 (H, W, 3) rgb).
-    :raises RecordingError: when it is not there, or its codec is unknown.
-    """
-    path = regular(path).resolve()  # with no scheme before it, such as cache:
-    if why := what_else(path):
-        raise RecordingError(f'{escaped(path)}: {why}')
-    options = {'format_whitelist': _FORMATS, 'protocol_whitelist': 'file'}
-    os.environ['OPENCV_FFMPEG_CAPTURE_OPTIONS'] = '|'.join(map(';'.join, options.items()))
-    capture, last = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG), -1.0
-    width, height = (capture.get(side) for side in (
-        cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-    if width * height * 3 > MAX_PICTURE_BYTES:
-        raise RecordingError(f'{escaped(path)}: {width:.0f}x{height:.0f} pixels are more than '
-                             f'{MAX_PICTURE_BYTES} bytes of rgb; make it smaller')
-    good, frame = capture.read()
-    if good:
-        period = 1 / (capture.get(cv2.CAP_PROP_FPS) or 25)
-        while good:
-            at = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            last = at if at > last else last + period  # some containers have no times
-            yield last, np.ascontiguousarray(frame[..., ::-1])
-            good, frame = capture.read()
-        return
-    try:
-        import av  # no dependency: its wheels hold GPL libraries
-    except ImportError:
-        raise RecordingError(
-            f'{escaped(path)}: is no video, or OpenCV knows no decoder for it, as for AV1; install'
-            ' PyAV (pip install av) if its licence suits you, or make it anew: ffmpeg -i OLD.mp4 '
-            '-c:v libvpx-vp9 NEW.mp4') from None
-    with av.open(str(path), options=options) as container:
-        for picture in container.decode(video=0):
-            yield float(picture.time), picture.to_ndarray(format='rgb24')

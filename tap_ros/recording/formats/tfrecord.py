@@ -37,6 +37,7 @@ from tap_ros.recording.formats.pictures import (
     Skipped,
     write_bag,
 )
+from tap_ros.recording.formats.videos import at_rate
 
 FPS = 5.0  # where nobody says another
 _MOST_RECORD = 2**31  # bytes; those of protobuf have fewer
@@ -62,14 +63,17 @@ def run(args: Options) -> None:
                 with skipped.errors_of('record', place):
                     features = parse_example(data)
                     camera = _choose(features, camera)
-                    frames, rows = decoded(
-                        _pictures(features, camera), _picture, skipped, f'record {place}')
+                    seconds: list[float] = []
+                    found = ((row / (args.fps or FPS), each)
+                             for row, each in enumerate(_pictures(features, camera)))
+                    frames, rows = decoded(at_rate(found, args.rate, seconds), _picture, skipped,
+                                           f'record {place}')
                     is_blank = _is_blank(frames[0])
                     blank[is_blank] += 1
                     said = features.get('steps/language_instruction') or [args.task.encode()]
                     if not is_blank:
                         yield make_episode(
-                            list(map(args.cut.image, frames)), rows / (args.fps or FPS),
+                            list(map(args.cut.image, frames)), np.array(seconds)[rows],
                             task=said[0].decode(errors='replace'), seed=number)
 
     print(f'{write_bag(args, episodes(), skipped)} of {escaped(camera)}')

@@ -1,0 +1,104 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which demonstrations are most alike, by small pictures of their start and goal.
+
+Distances are root mean squares of the differences of pixels, 0 to 255. They are found in whole
+numbers, so that they are the same on every machine; of equal ones the first index comes first.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+SIDE = 16  # px of a small picture, whose pixels are the means of areas
+LARGEST = 255.0  # distance of white from black
+_ROWS = 256  # whose distances from all others are held at once
+
+
+def ends_of(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """
+    Return what start and goal are compared by.
+
+    :param start: uint8 (H, W, 3) of any size; goal: likewise, also of another.
+    :return: uint8 (2, SIDE, SIDE, 3).
+    """
+    return np.stack([cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+                     for picture in (start, goal)])
+
+
+def nearest(asked: np.ndarray, known: np.ndarray, count: int,
+            exclude: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Find the demonstrations that are most alike.
+
+    :param asked: uint8 (Q, 2, SIDE, SIDE, 3), of ends_of.
+    :param known: uint8 (N, 2, SIDE, SIDE, 3), likewise, N of at least 1.
+    :param count: of demonstrations for each question; fewer where there are fewer.
+    :param exclude: (Q,) the index that each question must not find, for example its own.
+    :return: their indices int64 (Q, count) and distances float64 (Q, count), the nearest first.
+    """
+    count = min(count, len(known) - (exclude is not None))
+    columns = known.reshape(len(known), -1).astype(np.float64)  # which hold these sums exactly
+    squares = (columns ** 2).sum(1)
+    indices = np.empty((len(asked), count), np.int64)
+    distances = np.empty((len(asked), count))
+    for at in range(0, len(asked), _ROWS):
+        rows = asked[at:at + _ROWS].reshape(len(asked[at:at + _ROWS]), -1).astype(np.float64)
+        sums = (rows ** 2).sum(1)[:, None] + squares - 2 * rows @ columns.T
+        if exclude is not None:
+            sums[np.arange(len(rows)), exclude[at:at + _ROWS]] = np.inf
+        found = sums.argsort(1, kind='stable')[:, :count]
+        indices[at:at + _ROWS] = found
+        distances[at:at + _ROWS] = np.sqrt(
+            np.take_along_axis(sums, found, 1) / columns.shape[1])
+    return indices, distances
+
+
+def neighbours(ends: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Find for each demonstration the others that are most alike; see nearest.
+
+    :param ends: uint8 (N, 2, SIDE, SIDE, 3).
+    :return: indices int64 (N, count) and distances (N, count), never of itself; count is N - 1 at
+        most.
+    """
+    return nearest(ends, ends, count, np.arange(len(ends)))
+
+
+def usual_distance(ends: np.ndarray) -> float:
+    """
+    Return the largest distance of a demonstration from the one most alike.
+
+    A question that is farther from all of them is unlike them. Of one demonstration it is LARGEST:
+    nothing tells then.
+    """
+    return float(neighbours(ends, 1)[1].max()) if len(ends) > 1 else LARGEST
+
+
+def spread_out(ends: np.ndarray, count: int) -> np.ndarray:
+    """
+    Choose demonstrations that cover all of them.
+
+    First the most central one, then always the one farthest from those that are chosen.
+
+    :return: int64 (count,), or all, rising indices.
+    """
+    if len(ends) <= count:
+        return np.arange(len(ends))
+    columns = ends.reshape(len(ends), -1).astype(np.float64)
+    chosen = [int(nearest(columns.mean(0).round()[None], columns, 1)[0][0, 0])]
+    away = np.full(len(ends), np.inf)
+    while len(chosen) < count:
+        away = np.minimum(away, ((columns - columns[chosen[-1]]) ** 2).sum(1))
+        chosen.append(int(away.argmax()))
+    return np.sort(chosen)
+
+
+def unlike(distance: float, usual: float) -> str:
+    """Say that a question is unlike all demonstrations; '': it is not."""
+    return '' if distance <= usual else (
+        f'start and goal are unlike every demonstration: the most alike differs by {distance:.0f}'
+        f' (root mean square of pixels, 0 to 255), demonstrations among themselves by '
+        f'{usual:.0f} at most')

@@ -1,0 +1,88 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of retrieval, on recorded demonstrations."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tap_ros.prediction.retrieval import (
+    ends_of,
+    LARGEST,
+    nearest,
+    neighbours,
+    spread_out,
+    unlike,
+    usual_distance,
+)
+from tap_ros.recording.cache import open_recordings
+
+BAG = Path(__file__).parents[2] / 'bags' / 'sample_push2'
+
+
+@pytest.fixture(scope='module')
+def ends():
+    return np.stack([ends_of(episode.frames[0], episode.frames[-1])
+                     for episode in open_recordings([BAG], progress=False)])
+
+
+def distance(one, other):
+    """Return the root mean square difference of what two are compared by, the plain way."""
+    return np.sqrt(np.square(one.astype(float) - other).mean())
+
+
+def test_the_most_alike_come_first_and_a_demonstration_is_not_its_own_neighbour(ends):
+    plain = np.array([[distance(a, b) for b in ends] for a in ends])
+    indices, distances = nearest(ends, ends, 3)
+    assert (indices[:, 0] == np.arange(len(ends))).all() and (distances[:, 0] == 0).all()
+    np.fill_diagonal(plain, np.inf)
+    indices, distances = neighbours(ends, 5)
+    assert indices.shape == distances.shape == (len(ends), 5)
+    assert (indices == plain.argsort(1)[:, :5]).all()
+    assert np.allclose(distances, np.sort(plain, 1)[:, :5])
+    assert usual_distance(ends) == pytest.approx(plain.min(1).max())
+    assert neighbours(ends[:4], 9)[0].shape == (4, 3)  # there are no more
+
+
+def test_of_equally_alike_ones_the_first_is_found_whatever_is_asked_beside_it(ends):
+    twice = np.concatenate([ends, ends])
+    indices, _ = neighbours(twice, 3)
+    assert (indices[:20, 0] == np.arange(20, 40)).all()
+    assert (indices[20:, 0] == np.arange(20)).all()
+    assert (np.diff(indices[:, 1:]) == 20).all()
+    many = np.concatenate([ends] * 30)  # more than are compared at once
+    together = nearest(many, ends, 4)
+    alone = [nearest(one[None], ends, 4) for one in ends]
+    for part, parts in zip(together, zip(*alone)):
+        assert (part == np.concatenate([*parts] * 30)).all()
+
+
+def test_a_demonstration_that_is_moved_is_still_nearest_to_itself_at_any_size(ends):
+    first = open_recordings([BAG], progress=False)[0]
+    for scale in (1, 3):
+        start, goal = (frame.repeat(scale, 0).repeat(scale, 1)
+                       for frame in (first.frames[1], first.frames[-2]))
+        asked = ends_of(start, goal)
+        assert asked.shape == (2, 16, 16, 3) and asked.dtype == np.uint8
+        (index,), (away,) = (part[0] for part in nearest(asked[None], ends, 1))
+        assert index == 0 and 0 < away < usual_distance(ends)
+        assert not unlike(away, usual_distance(ends))
+
+
+def test_pictures_of_something_else_are_unlike_all(ends):
+    usual = usual_distance(ends)
+    start, goal = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
+    (away,), = nearest(ends_of(start, goal)[None], ends, 1)[1]
+    assert usual < away < LARGEST and f'by {away:.0f} (root' in unlike(away, usual)
+    assert usual_distance(ends[:1]) == LARGEST  # one demonstration tells nothing
+
+
+def test_what_is_chosen_covers_all(ends):
+    chosen = spread_out(ends, 6)
+    assert len({*chosen}) == 6 and (np.diff(chosen) > 0).all()
+    assert (spread_out(ends, 6) == chosen).all() and (spread_out(ends, 99) == np.arange(20)).all()
+    others = [np.random.default_rng(seed).permutation(20)[:6] for seed in range(20)]
+    reach = [nearest(ends, ends[some], 1)[1].max() for some in (chosen, *others)]
+    assert reach[0] <= np.median(reach[1:])
+    twins = np.concatenate([ends[:6], ends[:6]])
+    assert len({i % 6 for i in spread_out(twins, 6)}) == 6
