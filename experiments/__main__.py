@@ -15,8 +15,12 @@ LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weight
     'worlds-loop': ("push in another simulator's scenes, by models trained there",
                     'experiments.worlds.loop'),
     'labels': ('score labels that a few marks give all demonstrations', 'experiments.labels'),
+    'real': ('score predictors that a few marks of real demonstrations make',
+             'experiments.real'),
     'few': ('score what predictors learn from few demonstrations, simulated and real',
             'experiments.few'),
+    'fullsize': ("score how sharp subgoals are at the camera's resolution",
+                 'experiments.fullsize'),
     'tracking': ('score the tracker on simulated scenes and real films', 'experiments.tracking'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'bench': ('measure speed', {

@@ -7,12 +7,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-from tap_ros.apps.label_command import WITHIN_S
+from tap_ros.apps.label_command import describe_all, Signals, WITHIN_S
 from tap_ros.base.errors import ConfigError
-from tap_ros.base.options import File, Folder, Topic
-from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.reading import Reading
-from tap_ros.training.labels import Film, film_of, label, SIZE
+from tap_ros.base.options import File, Folder
+from tap_ros.recording.reading import Topics
+from tap_ros.training.labels import Film, label
 from tqdm import tqdm
 
 
@@ -27,6 +26,7 @@ class Options:
     :param recordings: one bag folder with all demonstrations.
     :param truth: JSON file {episode: {"grasp_s": 2.6, ...}}, s from the start of each episode.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param signals: parts of names of signals that count beside the pictures, such as Hand.
     :param marks: demonstrations that are marked in each draw.
     :param draws: how many; draw k has the seed k.
     :param out: folder for labels.json with the errors; '': none is written.
@@ -34,7 +34,8 @@ class Options:
 
     recordings: Folder
     truth: File
-    image_topic: Topic = ''
+    image_topic: Topics = ()
+    signals: Signals = ()
     marks: int = 10
     draws: int = 16
     out: Folder = ''
@@ -46,14 +47,12 @@ def run(options: Options) -> None:
 
     :raises ConfigError: for a truth of other demonstrations.
     """
-    store = open_recordings(options.recordings, reading=Reading(
-        image_topic=options.image_topic, crop='whole', size=SIZE))
+    store, films = describe_all(options.recordings, options.image_topic, options.signals)
     truth = json.loads(Path(options.truth).read_text())
     if len(truth) != len(store):
         raise ConfigError(f'truth: {len(truth)} episodes, and the recordings have {len(store)}')
     names = [name for name in truth['0'] if name.endswith('_s')]
     moments = [np.array([truth[str(i)][name] for name in names]) for i in range(len(store))]
-    films = [film_of(store, i) for i in tqdm(range(len(store)), desc='describing', delay=1)]
     errors: dict[str, list[np.ndarray]] = {'labels': [], 'fixed share of the time': []}
     for draw in tqdm(range(options.draws), desc='labelling', delay=1):
         chosen = np.random.default_rng(draw).choice(len(films), options.marks, replace=False)

@@ -59,7 +59,7 @@ class Options:
     weights: Annotated[str, conf.arg(
         metavar='FILE',
         help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}; or another '
-             'predictor, such as nearest_keyframe:bags/push2, which then has seen those bags.')]
+             'predictor, such as nearest_keyframe:bags/push2.')]
     recordings: Bags
     image_topic: Topic = ''
     all: Flag = False
@@ -78,17 +78,18 @@ def run(args: Options) -> None:
     network: PredictorNetwork | Predictor
     if predictor_files(args.weights):
         network, training = load_network(args.weights)
-        size = network.config.image_size
-        trained = trained_crop(training, (size, size))
+        size = (network.config.image_size,) * 2
+        trained = trained_crop(training, size)
     else:
         network, training = load_predictor(args.weights), {}
-        size, trained = network.image_size[0], network.camera_crop
+        size, trained = network.image_size, network.camera_crop
     bags = find_bags(args.recordings)
     store = open_recordings(bags, reading=reading_like(
         training, bags, args.image_topic, trained))
-    if store.image_size != (size, size):
-        raise ConfigError(f'{args.weights}: made for {size} pixels a side, '
-                          f'the recordings have {store.image_size}; use matching ones')
+    if store.image_size != size:
+        raise ConfigError(f'{args.weights}: made for {size[1]}x{size[0]} pixels (width x height), '
+                          'the recordings have {1}x{0}; use matching ones'.format(
+                              *store.image_size))
     robot_mask, settings = trained_robot_mask(training)[0], training.get('settings', {})
     kept, episodes = with_masks(store, split_as_trained(
         store, {} if args.all else training, settings.get('test_fraction', TEST_FRACTION)),

@@ -13,17 +13,19 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 from tap_ros.base.files import write_atomically
-from tap_ros.base.options import File, Folder, Topic
+from tap_ros.base.options import File, Folder
 from tap_ros.base.text import listing
 from tap_ros.evaluation.intervals import share_interval
 from tap_ros.images.drawing import png_bytes
+from tap_ros.recording.bags import Paths
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.events import Event, write_events
 from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
 from tap_ros.recording.marks import beside, Mark, numbered, read_marks, write_marks
 from tap_ros.recording.metadata import FILE_NAME
-from tap_ros.recording.reading import Reading
-from tap_ros.training.labels import film_of, label, Labels, SIZE
+from tap_ros.recording.reading import Reading, Topics
+from tap_ros.training.films import film_together, signals_like
+from tap_ros.training.labels import Film, label, Labels, SIZE
 from tqdm import tqdm
 from tyro import conf
 
@@ -33,6 +35,8 @@ SHEET_SIZE = 96, 128  # px, height and width, of a picture in the contact sheet
 SHEET_ROWS = 40  # demonstrations in it, at most
 BEFORE_AND_AFTER_S = (-0.5, 0.0, 0.5)
 _LINE = 14  # px of a line of text
+Signals = Annotated[tuple[str, ...], conf.arg(
+    metavar='PART [PART ...]', help_behavior_hint='(default: none)')]
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,8 @@ class Options:
     :param out: folder for labels.json, labels.csv, labels.png, labels.marks.json, the labels as
         marks, and of each bag an MCAP file that viewers open together with it.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+        Of several all count; labels.png shows the first.
+    :param signals: parts of names of signals that count beside the pictures, such as Hand.
     :param write_lerobot: the LeRobot data set from which the recording was imported: its rows get
         the subtasks that the labels tell apart.
     """
@@ -53,7 +59,8 @@ class Options:
         metavar='BAG [BAG ...]', help_behavior_hint='(required)')]
     out: Folder
     marks: File = ''
-    image_topic: Topic = ''
+    image_topic: Topics = ()
+    signals: Signals = ()
     write_lerobot: Folder = ''
 
 
@@ -63,16 +70,13 @@ def run(options: Options) -> None:
 
     :raises TapError: for recordings or marks that cannot be used.
     """
-    store = open_recordings(options.recordings, reading=Reading(
-        image_topic=options.image_topic, crop='whole', size=SIZE))
+    store, films = describe_all(options.recordings, options.image_topic, options.signals)
     path = Path(options.marks) if options.marks else beside(options.recordings[0])
     marks = read_marks(path, store)
     marked = {i: store.seconds(i)[[(first + last) // 2 for first, last in those]]
               for i, those in marks.episodes.items()}
     names = marks.names or tuple(
         f'mark {k + 1}' for k in range(len(next(iter(marked.values()), ()))))
-    films = [film_of(store, i) for i in tqdm(
-        range(len(store)), desc='describing', unit='demonstration', delay=1)]
     labels = label(films, marked, names)
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -105,6 +109,26 @@ def run(options: Options) -> None:
           'whether all marks are early or late')
 
 
+def describe_all(recordings: Paths, image_topics: Sequence[str],
+                 signals: Sequence[str]) -> tuple[EpisodeStore, list[Film | None]]:
+    """Return the demonstrations as the first camera saw them, and what is known of each."""
+    store, *beside = (open_recordings(recordings, reading=Reading(
+        image_topic=topic, crop='whole', size=SIZE)) for topic in image_topics or ('',))
+    names = signals_like(store, signals)
+    return store, [film_together(store, i, beside, names) for i in tqdm(
+        range(len(store)), desc='describing', unit='demonstration', delay=1)]
+
+
+def frames_of(store: EpisodeStore, i: int, moments: np.ndarray) -> Sequence[Mark]:
+    """Return the frames of moments (M,) s as marks; none where these would not be in order."""
+    if not np.isfinite(moments).all():
+        return ()
+    stamps = store[i].stamps
+    away = np.abs((stamps - stamps[0]) / 1e9 - moments[:, None])
+    frames = away[:, 1:-1].argmin(1) + 1  # neither start nor goal
+    return [(t, t) for t in frames.tolist()] if (np.diff(frames) > 0).all() else ()
+
+
 def distinct_names(store: EpisodeStore) -> dict[Path, str]:
     """Return a name for each bag of a store, by its first file: that of its folder or file."""
     names: dict[Path, str] = {}
@@ -129,15 +153,6 @@ def events_of(store: EpisodeStore, i: int, labels: Labels, parts: Sequence[str])
             *store.recorded(i, t)[2:], subtask, name,
             f'demonstration {i} at {second:.1f} s, {sure:.0%}', sure < UNSURE))
     return [ends[0], *moments, ends[1]]
-
-
-def frames_of(store: EpisodeStore, i: int, moments: np.ndarray) -> Sequence[Mark]:
-    """Return the frames of moments (M,) s as marks; none where these would not be in order."""
-    if not np.isfinite(moments).all():
-        return ()
-    away = np.abs(store.seconds(i) - moments[:, None])
-    frames = away[:, 1:-1].argmin(1) + 1  # neither start nor goal
-    return [(t, t) for t in frames.tolist()] if (np.diff(frames) > 0).all() else ()
 
 
 def to_csv(rows: Sequence[dict[str, object]]) -> str:

@@ -139,12 +139,11 @@ def image_fields(image: np.ndarray | None, stamp: Stamp | int, frame_id: str) ->
 
 
 def jpeg_fields(image: np.ndarray, stamp: Stamp | int, frame_id: str) -> dict[str, Any]:
-    """Return the fields of a sensor_msgs/CompressedImage, with all colours; else as above."""
+    """Return the fields of a sensor_msgs/CompressedImage; colours halved, as videos have them."""
     import cv2  # here, as in encodings.py
     check_image(image, 'image')
     data = cv2.imencode('.jpg', cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [
-        cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444])[1]
+        cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     return {'header': header_fields(stamp, frame_id), 'format': 'rgb8; jpeg compressed bgr8',
             'data': data}
 

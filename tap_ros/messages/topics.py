@@ -57,6 +57,8 @@ CAMERA_INFO = Topic('camera/camera_info', 'sensor_msgs/msg/CameraInfo', periodic
 CAMERA_POSE = Topic('camera/pose', 'geometry_msgs/msg/PoseStamped', latched=True)
 OBJECTS = Topic('objects', 'tap_msgs/msg/ObjectStates', 'object', periodic=True)
 JOINT_STATES = Topic('joint_states', 'sensor_msgs/msg/JointState', 'joint', periodic=True)
+# Numbers by name, of whatever the robot measures; joints of which nothing is known move no arm.
+SIGNALS = Topic('signals', JOINT_STATES.type, 'signal')
 TWIST = Topic('arm/delta_twist_cmds', 'geometry_msgs/msg/TwistStamped', 'twist')
 GRIPPER_COMMAND = Topic('gripper/command', 'std_msgs/msg/Float64', 'command')
 GOAL_IMAGE = Topic('goal/image', IMAGE_TYPE, 'goal', latched=True, compressed=True)
@@ -71,8 +73,9 @@ CLOCK = Topic('clock', 'rosgraph_msgs/msg/Clock')
 MODEL_CARDS = tuple(Topic(f'{node}/model_card', 'std_msgs/msg/String', latched=True)
                     for node in ('predictor_node', 'visual_mpc_node'))
 TOPICS = (
-    IMAGE, ROBOT_MASK, CAMERA_INFO, CAMERA_POSE, OBJECTS, JOINT_STATES, TWIST, GRIPPER_COMMAND,
-    GOAL_IMAGE, GOAL_ROBOT_MASK, GOAL_OBJECTS, TRUE_OBJECTS, TRUE_GOAL_OBJECTS, EPISODE, CLOCK,
+    IMAGE, ROBOT_MASK, CAMERA_INFO, CAMERA_POSE, OBJECTS, JOINT_STATES, SIGNALS, TWIST,
+    GRIPPER_COMMAND, GOAL_IMAGE, GOAL_ROBOT_MASK, GOAL_OBJECTS, TRUE_OBJECTS, TRUE_GOAL_OBJECTS,
+    EPISODE, CLOCK,
     Topic('subgoal', 'tap_msgs/msg/Subgoal', latched=True),
     Topic('subgoal/image', IMAGE_TYPE, latched=True),
     Topic('subgoal/overlay', IMAGE_TYPE, latched=True),

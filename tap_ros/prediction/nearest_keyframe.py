@@ -11,7 +11,7 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.images.crop import trained_crop
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.protocol import check_request, Predictor, Request
-from tap_ros.prediction.retrieval import ends_of, nearest, unlike, usual_distance
+from tap_ros.prediction.retrieval import ends_of, nearest_others, unlike, usual_distance
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
@@ -25,7 +25,8 @@ class NearestKeyframe(Predictor):
     """
     Show the median of the keyframes of the recorded episodes that are most alike.
 
-    These are the NEIGHBOURS with the most alike start and goal pictures, see retrieval. Of each
+    These are the NEIGHBOURS with the most alike start and goal pictures, but for the one that is
+    asked about, see retrieval.nearest_others; so recordings can be scored by themselves. Of each
     the keyframe is the one that is marked, the last where several are; without marks the frame
     half way from the first picture to the last, by what they show. With recursion it is the mark
     before, or half way to the keyframe before. Objects are where they were in the recordings, not
@@ -81,7 +82,7 @@ class NearestKeyframe(Predictor):
     def _answer(self, request: Request) -> list[Subgoal]:
         """Return the keyframes for one request, the earliest first."""
         pictures, pixels = check_request(request, self.mode, self.image_size)
-        indices, distances = nearest(ends_of(*pictures)[None], self._ends, NEIGHBOURS)
+        indices, distances = nearest_others(ends_of(*pictures)[None], self._ends, NEIGHBOURS)
         alike = [self._episodes[i] for i in indices[0]]
         distance = float(distances[0, 0])
         found, at = [], [len(episode) - 1 for episode in alike]

@@ -15,6 +15,7 @@ from typing import Literal
 
 from tap_ros.base.errors import check_fields, ConfigError
 from tap_ros.images.crop import is_halved
+from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.warp import combine, warp
 import torch
 from torch import nn
@@ -29,7 +30,8 @@ class PredictorConfig:
     :param image_size: pixels on each side, a power of two or three times one, from 16 on; the
         paper has 64.
     :param base_width: channels of the first block; they double at each following one. Paper: 32.
-    :param num_context: pictures that the prediction is conditioned on: 2 is start and goal.
+    :param num_context: pictures that the prediction is conditioned on: 2 is start and goal, 3 adds
+        the keyframe of the most alike demonstration, see keyframe_bank.
     :param code_size: length of the vector between encoder and decoders.
     :param latent_size: length of z, appended to that vector; 0 is a deterministic predictor.
     :param new_pixels: whether there is a decoder for pixels that cannot be copied. Object maps
@@ -211,7 +213,11 @@ class PredictorNetwork(nn.Module):
     One encoder reads each context picture; their features are concatenated. Three decoders of
     the same shape give the new pixels, the flow and the masks (appendix C, its last figure), or
     one gives all of them (`decoder='shared'`).
+
+    :ivar bank: what the third picture of a network for three comes from, unless it is given.
     """
+
+    bank: KeyframeBank | None = None
 
     def __init__(self, config: PredictorConfig) -> None:
         """Build the network with fresh weights."""
@@ -245,10 +251,13 @@ class PredictorNetwork(nn.Module):
         """
         Predict.
 
-        :param context: (B, C, 3, H, W) in [-1, 1].
+        :param context: (B, C, 3, H, W) in [-1, 1]; of a network with a bank also without the
+            third picture, which then is looked up.
         :param z: (B, latent_size), or None for zeros, the mean of the prior.
         :return: a Prediction.
         """
+        if self.bank is not None and context.shape[1] == 2:
+            context = self.bank.completed(context)
         B, C, _, H, W = context.shape
         x, levels = context.flatten(0, 1), []                   # B*C, 3, 64, 64
         for layer in self.encoder:

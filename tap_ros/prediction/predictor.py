@@ -13,6 +13,7 @@ from tap_ros.images.crop import trained_crop
 from tap_ros.images.pixels import resize_pixels, to_float
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.fullsize import answer_size, enlarged, fit, pictures_of
+from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.protocol import check_request, Predictor, Request
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps, WarpedMaps
@@ -28,7 +29,7 @@ class SubgoalPredictor(Predictor):
 
     :ivar config: PredictorConfig.
     :ivar image_size: (height, width) of the pictures that the network sees.
-    :ivar mode: 'bidirectional' for two of them, 'forward' for one.
+    :ivar mode: 'bidirectional' for two of them, also with a keyframe; 'forward' for one.
     :ivar training: dict saying how the weights were made.
     :ivar camera_crop: TrainedCrop: what to make of a camera's pictures before it sees them.
     """
@@ -43,12 +44,13 @@ class SubgoalPredictor(Predictor):
         :param network: PredictorNetwork, on the device it shall run on.
         :param training: dict saying how the weights were made.
         :param source: how errors call it, for example the file of its weights.
-        :raises ConfigError: if it takes more than a start and a goal picture.
+        :raises ConfigError: if it takes more than a start and a goal picture, and a keyframe.
         :raises WeightsError: if it predicts nonsense.
         """
-        if network.config.num_context not in (1, 2):
+        if network.config.num_context not in ((1, 2) if network.bank is None else (3,)):
             raise ConfigError('predictor: needs weights for 2 context pictures, start and goal, '
-                              f'or for 1, the start; these are for {network.config.num_context}')
+                              'for 1, the start, or for 3 with a bank of keyframes; these are for '
+                              f'{network.config.num_context}')
         self.config = network.config
         self.mode = 'forward' if network.config.num_context == 1 else 'bidirectional'
         self.image_size = (network.config.image_size, network.config.image_size)
@@ -120,6 +122,14 @@ class SubgoalPredictor(Predictor):
                          for N, (pictures, _) in zip(counts, scenes)])
         sources = [pictures_of(request) for N, request in zip(counts, requests) for _ in range(N)]
         sizes = [answer_size(pictures) for pictures in sources]
+        said: list[dict[str, Any]] = [{} for _ in requests]
+        if (bank := self._network.bank) is not None:  # one keyframe for all levels of a request
+            context = bank.completed(context)
+            numbers, distances = bank.find(np.stack([pictures for pictures, _ in scenes]))
+            said = [{'distance': distance, 'warning': bank.unlike(distance)}
+                    for distance in distances.tolist()]
+            shown = np.repeat(numbers, counts).tolist()
+            sources = [[*pictures, bank.keyframes[i]] for pictures, i in zip(sources, shown)]
         maps = _join([  # rows, C, K, H, W
             one_hot_maps(torch.from_numpy(pixels).to(self._device), self.image_size).expand(
                 N, -1, -1, -1, -1) for N, (_, pixels) in zip(counts, scenes)])
@@ -136,13 +146,16 @@ class SubgoalPredictor(Predictor):
             prediction = self._network(context, z)
             warped = warp_object_maps(maps, prediction.flow, prediction.masks)
             images = enlarged(prediction, sources[:rows], sizes)
-            found = _to_subgoals(images, warped, counts[:going], level)
+            found = _to_subgoals(images, warped, counts[:going], level, said)
             for subgoals, chain in zip(found, levels):
                 chain.append(subgoals)
-            # The prediction takes the place of the last picture.
-            context = torch.cat([context[:, :-1], prediction.image.clamp(-1, 1)[:, None]], 1)
+            # The prediction takes the place of the last picture that was sent.
+            at = maps.shape[1] - 1
+            context = torch.cat([context[:, :at], prediction.image.clamp(-1, 1)[:, None],
+                                 context[:, at + 1:]], 1)
             maps = torch.cat([maps[:, :-1], warped.maps[:, None]], 1)
-            sources = [[*pictures[:-1], image] for pictures, image in zip(sources, images)]
+            sources = [[*pictures[:at], image, *pictures[at + 1:]]
+                       for pictures, image in zip(sources, images)]
         if self.mode == 'bidirectional':
             for chain in levels:
                 chain.reverse()  # each level lies before the one that it was predicted from
@@ -162,7 +175,13 @@ def load_network(path: str | Path,
     """
     path = find_predictor(path)
     values, state, training = load_weights(path, 'predictor')
+    bank = KeyframeBank.take(state, path)
     network = make_network(PredictorNetwork, PredictorConfig, values, state, path)
+    if (bank is None) == (network.config.num_context == 3):
+        raise WeightsError(f'{escaped(path)}: weights for {network.config.num_context} pictures '
+                           f'with{"out" * (bank is None)} a bank of keyframes, which those for 3 '
+                           'have; train again')
+    network.bank = bank
     network.eval().requires_grad_(False)
     return placed(network, device), training
 
@@ -173,10 +192,11 @@ def _join(parts: list[torch.Tensor]) -> torch.Tensor:
 
 
 def _to_subgoals(images: Sequence[np.ndarray], warped: WarpedMaps, counts: Sequence[int],
-                 level: int) -> list[list[Subgoal]]:
-    """Turn the predictions of one level into lists of Subgoal, counts[i] for request i."""
+                 level: int, said: Sequence[dict[str, Any]]) -> list[list[Subgoal]]:
+    """Turn the predictions of one level into Subgoals, counts[i] for request i, with said[i]."""
     maps, mass = warped.maps.cpu().numpy(), warped.mass.cpu().numpy()
     places = expected_pixels(warped.maps).cpu().numpy()
     rows = zip(images, maps, [resize_pixels(at, maps.shape[-2:], image.shape[:2])
                               for at, image in zip(places, images)], mass)
-    return [[Subgoal(*next(rows), sample=n, level=level) for n in range(N)] for N in counts]
+    return [[Subgoal(*next(rows), sample=n, level=level, **more) for n in range(N)]
+            for N, more in zip(counts, said)]

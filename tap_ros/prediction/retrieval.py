@@ -56,6 +56,22 @@ def nearest(asked: np.ndarray, known: np.ndarray, count: int,
     return indices, distances
 
 
+def nearest_others(asked: np.ndarray, known: np.ndarray,
+                   count: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Find the demonstrations that are most alike, without the one that is asked about.
+
+    One whose start and goal are exactly those that are asked is the same demonstration. It is left
+    out, as in training none is its own neighbour; and found where it is the only one.
+
+    :return: as nearest; count is N - 1 at most, or 1.
+    """
+    indices, distances = nearest(asked, known, count + 1)
+    columns = np.arange(max(1, min(count, len(known) - 1))) + (
+        (distances[:, :1] == 0) & (len(known) > 1))
+    return (np.take_along_axis(indices, columns, 1), np.take_along_axis(distances, columns, 1))
+
+
 def neighbours(ends: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """
     Find for each demonstration the others that are most alike; see nearest.

@@ -104,12 +104,13 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
     if the masks hide these too, their plain mean.
 
     :param maps: (B, C, K, H, W), maps in each context picture, each summing to 1.
-    :param flow: (B, C, 2, H, W) in pixels.
-    :param masks: (B, C or C+1, 1, H, W); the new pixels' mask is left out, for new pixels
-        have no origin.
+    :param flow: (B, C or more, 2, H, W) in pixels.
+    :param masks: (B, C or more, 1, H, W). What comes after the first C is left out: new pixels
+        have no origin, and in a keyframe of another demonstration the objects are not known. The
+        mass tells how much of an object is copied from there.
     :return: WarpedMaps.
     """
-    masks = masks[:, :maps.shape[1]]
+    flow, masks = flow[:, :maps.shape[1]], masks[:, :maps.shape[1]]
     candidates = [combine(warp(maps, flow), masks)]  # B, K, H, W
     mass = candidates[0].sum((-2, -1))
     if bool((mass < MIN_MASS).any()):

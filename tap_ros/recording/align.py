@@ -63,6 +63,7 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     clock = _Clock(spans, np.concatenate([[0], np.cumsum(counts)]), frame)
     picked, goal_rows = _pick_names(tracks, clock, gaps)
     names.append(('',))  # of number -1, where there are none
+    measured, signals = _signals(tracks['signal'], clock, names)
     return EpisodeTable(
         parts=parts, starts=clock.starts, spans=spans, stamps=frame.stamp, logs=frame.log,
         places={'frame': (frame.file, frame.index), 'mask': _masks(tracks['mask'], clock, parts),
@@ -72,7 +73,8 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
         objects=_by_name(*clock.nearest_rows(tracks['object']), tracks['object'], names,
                          picked[clock.owner]),
         names=[names[i] for i in picked.tolist()],
-        goal_objects=_by_name(goal_rows, goal_rows >= 0, tracks['goal_object'], names, picked))
+        goal_objects=_by_name(goal_rows, goal_rows >= 0, tracks['goal_object'], names, picked),
+        signals=signals, signal_names=measured)
 
 
 class _Clock:
@@ -310,11 +312,22 @@ def _pick_names(tracks: dict[str, Track], clock: _Clock,
     return picked, goal_rows
 
 
+def _signals(signal: Track, clock: _Clock, names: Sequence[tuple[str, ...]],
+             ) -> tuple[list[tuple[str, ...]], np.ndarray]:
+    """Return the names of each episode's signals, those of its first message, and (F, D)."""
+    rows, found = clock.nearest_rows(signal)
+    seen = np.where(found, np.append(signal.index, -1)[rows], -1)
+    first = np.array([next(iter(own[own >= 0]), -1) for own in (
+        seen[a:b] for a, b in zip(clock.starts, clock.starts[1:]))], np.int64)
+    return ([names[i][1:] for i in first.tolist()],
+            _by_name(rows, found, signal, names, first[clock.owner])[..., 0])
+
+
 def _by_name(rows: np.ndarray, found: np.ndarray, track: Track,
              names: Sequence[tuple[str, ...]], wanted: np.ndarray) -> np.ndarray:
-    """Return (N, K, 9): values of N rows that are found, objects in the order of names[wanted]."""
+    """Return (N, K, width): values of N rows that are found, in the order of names[wanted]."""
     most = max((len(names[i]) - 1 for i in np.unique(wanted).tolist()), default=0)
-    out = np.full((len(rows), most, 9), np.nan)
+    out = np.full((len(rows), most, track.values.shape[1]), np.nan)
     numbers = np.where(found, np.append(track.index, -1)[rows], -1)
     for number, want in np.unique(np.stack([numbers, wanted], 1)[found], axis=0).tolist():
         same = np.flatnonzero(found & (numbers == number) & (wanted == want))

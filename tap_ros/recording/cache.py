@@ -49,7 +49,7 @@ from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tap_ros.recording.topic_choice import Bag, list_paths
 from tqdm import tqdm
 
-FORMAT = 9  # of a cache folder; another number makes all files be decoded again
+FORMAT = 10  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
 _SETTLED_NS = 2 * 10**9  # a file changed later may change again and show the same time

@@ -17,7 +17,7 @@ from typing import Any
 import zlib
 
 import numpy as np
-from tap_ros.base.contract import GRIPPER_JOINTS
+from tap_ros.base.contract import GRIPPER_JOINTS, MOST_SIGNALS
 from tap_ros.base.errors import ImageError, RecordingError
 from tap_ros.base.text import escaped
 from tap_ros.images.crop import CENTRE
@@ -34,7 +34,9 @@ from tap_ros.robots.arm import find_joints, known_arms, MOST_JOINTS
 
 PICTURES = ('frame', 'mask', 'goal', 'goal_mask')
 WIDTHS = {'frame': 1, 'twist': 3, 'command': 1, 'joint': 4, 'arm': MOST_JOINTS,
-          'object': 9, 'goal_object': 9}  # of the values of a message, or of each object in it
+          'object': 9, 'goal_object': 9, 'signal': 1}  # of the values of a message, or of each
+# object or signal in it
+NAMED = ('object', 'goal_object', 'signal')  # whose index is the number of the names
 NAMES = (*PICTURES, *list(WIDTHS)[1:], 'mark')
 _GOALS = ('goal', 'goal_mask', 'goal_object')
 _CUTTING = ('twist', 'command', 'mark')  # without one of them an episode is no longer known
@@ -55,6 +57,7 @@ class Columns:
         joint_values (N, 4) gripper state, NaN where unknown
         arm_values (N, MOST_JOINTS) rad, of an arm where the gripper's place is not told
         object_values, goal_object_values (sum of objects, 9) u, v, pose
+        signal_values (sum of signals, 1)
         gap (G, 2) int64: where episodes are cut, as defects.gaps gives it
     """
 
@@ -63,7 +66,8 @@ class Columns:
     camera_size: tuple[int, int] | None = None  # of most, before they were cut and scaled
     pictures: dict[str, np.ndarray] = field(default_factory=dict)  # (N, H, W, 3) or (N, H, W)
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
-    names: list[tuple[str, ...]] = field(default_factory=list)  # source of objects, then theirs
+    names: list[tuple[str, ...]] = field(default_factory=list)  # source of objects, then theirs;
+    # '', then those of signals
     marks: list[Mark] = field(default_factory=list)  # by row of mark
     damage: list[str] = field(default_factory=list)  # lines: what could not be used, and why
     shapes: dict[str, list[int]] = field(default_factory=dict)  # of pictures, by name
@@ -168,7 +172,7 @@ class _Decoder:
         self.decoders: dict[str, Callable[[str, int, Any], object]] = {
             **dict.fromkeys(PICTURES, self._picture), 'twist': self._twist,
             'command': lambda name, log, message: self._add(name, log, 0, 0, (message.data,)),
-            'joint': self._joints, 'mark': self._mark,
+            'joint': self._joints, 'mark': self._mark, 'signal': self._signals,
             'object': self._objects, 'goal_object': self._objects}
 
     def take(self, topic: str, kind: str, log: int, data: memoryview) -> None:
@@ -313,6 +317,14 @@ class _Decoder:
         arm = None if known.keys() & set(PLACE) else find_joints(known, self.arms)
         if arm is not None and np.isfinite(arm).all():
             self._add('arm', log, stamp, 0, np.pad(arm, (0, MOST_JOINTS - len(arm))))
+
+    def _signals(self, name: str, log: int, message: Any) -> None:
+        names, values = tuple(message.name), np.asarray(message.position, float)
+        if len(values) != len(names) or len(names) > MOST_SIGNALS:
+            raise RecordingError(f'{len(values)} numbers with {len(names)} names; expected as '
+                                 f'many, at most {MOST_SIGNALS}')
+        self._add(name, log, to_nanoseconds(message.header.stamp), self._number(
+            ('', *names)), values.tolist())
 
     def _objects(self, name: str, log: int, message: Any) -> None:
         numbers: list[float] = []

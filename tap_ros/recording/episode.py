@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from tap_ros.base.contract import MOST_SIGNALS
 from tap_ros.base.errors import ImageError, RecordingError
 from tap_ros.images.pixels import check_mask
 
@@ -44,6 +45,8 @@ class Episode:
     # (T, H, W) uint8, ROBOT_MASK_FREE, _HAND or _ARM; None unless every frame has one
     robot_masks: np.ndarray | None = None
     goal_mask: np.ndarray | None = None  # (H, W) uint8: likewise, of the picture of the goal
+    signal_names: tuple[str, ...] = ()  # D, of whatever else was measured or commanded
+    signals: np.ndarray | None = None  # (T, D) float32; NaN where unknown; None without names
 
     def __len__(self) -> int:
         """Return the number of frames T."""
@@ -65,8 +68,8 @@ def check_episode(episode: Episode) -> None:
         'object_pixels': ((T, K, 2), np.float32), 'object_poses': ((T, K, 7), np.float64),
         'goal_pixels': ((K, 2), np.float32), 'goal_poses': ((K, 7), np.float64),
         'goal_frame': ((*size, 3), np.uint8), 'robot_masks': ((T, *size), np.uint8),
-        'goal_mask': (size, np.uint8)}
-    for field in ('goal_frame', 'robot_masks', 'goal_mask'):
+        'goal_mask': (size, np.uint8), 'signals': ((T, len(episode.signal_names)), np.float32)}
+    for field in ('goal_frame', 'robot_masks', 'goal_mask', 'signals'):
         if getattr(episode, field) is None:
             del wanted[field]
     for field, (shape, dtype) in wanted.items():
@@ -83,6 +86,10 @@ def check_episode(episode: Episode) -> None:
             raise RecordingError(f'Episode.{field}: {error}') from error
     if episode.goal_mask is not None and episode.goal_frame is None:
         raise RecordingError('Episode.goal_mask: expected None, as there is no goal_frame')
+    if (episode.signals is None) != (not episode.signal_names) or not len(
+            episode.signal_names) <= MOST_SIGNALS:
+        raise RecordingError('Episode.signals: expected a column for each of signal_names, at '
+                             f'most {MOST_SIGNALS}')
     if T == 0 or 0 in size:
         raise RecordingError('Episode.frames: expected at least one frame of at least one pixel')
     if episode.stamps[0] < 0 or (np.diff(episode.stamps) <= 0).any():
@@ -110,6 +117,8 @@ class EpisodeTable:
     objects: np.ndarray  # (F, K, 9) float64: u, v, pose
     names: list[tuple[str, ...]]  # E: source of the objects, then theirs
     goal_objects: np.ndarray  # (E, K, 9) float64
+    signals: np.ndarray  # (F, D) float64, D at most
+    signal_names: list[tuple[str, ...]]  # E
 
     def __len__(self) -> int:
         return len(self.spans)
@@ -143,11 +152,14 @@ class EpisodeTable:
         span = self.spans[i]
         with np.errstate(over='ignore'):  # absurd pixels become infinite
             pixels, goal_pixels = (a[..., :2].astype(np.float32) for a in (objects, goals))
+            measured = self.signal_names[i]
+            signals = self.signals[rows, :len(measured)].astype(np.float32)
         return Episode(
             frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
             grippers=self.grippers[rows], object_names=tuple(names), object_source=source,
             object_pixels=pixels, object_poses=objects[..., 2:],
             goal_frame=None if goal_frame is None else goal_frame[0], goal_pixels=goal_pixels,
             goal_poses=goals[:, 2:], task=span.task, seed=span.seed, outcome=span.outcome or '',
+            signal_names=measured, signals=signals if measured else None,
             robot_masks=self.pictures('mask', rows),
             goal_mask=None if goal_mask is None else goal_mask[0])

@@ -18,7 +18,7 @@ import numpy as np
 from tap_ros.base.errors import RecordingWarning
 from tap_ros.base.text import escaped
 from tap_ros.messages.stamps import PROOF
-from tap_ros.recording.columns import Columns, Mark, NAMES, Track, WIDTHS
+from tap_ros.recording.columns import Columns, Mark, NAMED, NAMES, Track, WIDTHS
 from tap_ros.recording.defects import FAR
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import find_rounds, read_spans, Span
@@ -32,7 +32,7 @@ _PAUSE_NS = 5 * 10**8  # of a camera, in which its clock may be set back unseen
 _OVERTAKEN_NS = 10**8  # a frame may be logged so long before the mark that precedes it
 _LONG = 30  # messages beside a place that tell what it is
 _SMOOTH = 9  # messages that tell how far two clocks are apart
-_STREAMS = ('frame', 'twist', 'joint', 'arm', 'object')
+_STREAMS = ('frame', 'twist', 'joint', 'arm', 'signal', 'object')
 
 
 def read_tracks(parts: Sequence[Columns], reading: Reading) -> tuple[
@@ -79,13 +79,13 @@ def join(parts: Sequence[Columns]) -> tuple[dict[str, Track], list[tuple[str, ..
         for file, part in enumerate(parts):
             found = part.arrays.get(name, np.empty((0, 4), np.int64)).copy()
             found[:, 2] += file << 40  # later files are behind earlier ones
-            if 'object' in name:
+            if name in NAMED:
                 local = np.array([numbers[tuple(n)] for n in part.names], np.int64)
                 found[:, 3] = local[found[:, 3]]
             rows.append(np.insert(found, 4, file, axis=1))
             values.append(part.arrays.get(f'{name}_values', values[0]))
         log, stamp, order, index, owner = np.concatenate(rows).T
-        lengths = counts[index] if 'object' in name else np.ones(len(log), np.int64)
+        lengths = counts[index] if name in NAMED else np.ones(len(log), np.int64)
         tracks[name] = Track(log, stamp, order, index, owner, np.cumsum(lengths) - lengths,
                              np.concatenate(values))
     return tracks, list(numbers), [mark for part in parts for mark in part.marks]
@@ -116,7 +116,7 @@ def correct_times(tracks: Mapping[str, Track], part: Columns,
                 'times take their place, for all topics')
         tracks |= _all_by_log(tracks)
     else:
-        for name in ('twist', 'joint', 'arm', 'object', 'mark'):
+        for name in ('twist', 'joint', 'arm', 'object', 'signal', 'mark'):
             tracks[name], is_apart = _comparable(name, tracks[name], frame)
             if is_apart:
                 topic = part.topics.get('joint' if name == 'arm' else name)
@@ -204,7 +204,8 @@ def _comparable(name: str, track: Track, frame: Track) -> tuple[Track, bool]:
         return replace(track, stamp=by_log * ~zero) if is_apart else track, is_apart
     if zero.any():  # a command answers a frame
         track = replace(track, stamp=np.where(
-            zero, by_log if name in ('joint', 'arm') else shown.stamp[newest], track.stamp))
+            zero, by_log if name in ('joint', 'arm', 'signal') else shown.stamp[newest],
+            track.stamp))
     is_apart = _is_apart(track, frame)
     return replace(track, stamp=by_log) if is_apart else track, is_apart
 

@@ -284,6 +284,10 @@ class EpisodeWriter:
         if not np.isnan(episode.grippers[t]).all():
             self._put(topics.JOINT_STATES, stamp, joint_fields(
                 episode.grippers[t], stamp, WORLD_FRAME))
+        if episode.signals is not None:
+            self._put(topics.SIGNALS, stamp, {
+                'header': header_fields(stamp, ''), 'name': list(episode.signal_names),
+                'position': episode.signals[t].astype(float)})
         if t < len(episode.stamps) - 1 and not np.isnan(episode.actions[t]).all():
             x, y, z, opening = episode.actions[t].tolist()
             self._put(topics.TWIST, stamp, {

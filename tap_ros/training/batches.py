@@ -19,6 +19,7 @@ import torch
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
     from tap_ros.recording.episode import Episode
+    from tap_ros.training.keyframes import Keyframes
 
 REACHED = 2.0  # px
 
@@ -28,7 +29,8 @@ class Batch:
     """
     Context pictures and the frames to predict, of B episodes.
 
-    :param context: uint8 (B, C, H, W, 3): start and goal, or in forward prediction the start.
+    :param context: uint8 (B, C, H, W, 3): start and goal, or in forward prediction the start; in
+        trainings with keyframes also one of these.
     :param targets: uint8 (B, T, H, W, 3); some frame where padded.
     :param times: int64 (B, T), when each target was seen; the start picture is time 0.
     :param first: int64 (B, 1), the earliest time a target of this episode could have.
@@ -37,8 +39,8 @@ class Batch:
     :param valid: bool (B, T), False where padded.
     :param video: uint8 (B, N, H, W, 3), the episode from start to goal at N moments at equal
         distances; None unless asked for.
-    :param bare: uint8 (B, C, H, W, 3), the context pictures without the robot, filled as targets
-        and video are then; None: the context itself.
+    :param bare: uint8 (B, 1 or 2, H, W, 3), start and goal as errors are measured with them:
+        without the robot, filled as targets and video are then; None: the context itself.
     :param seen: bool (B, H, W), False where the robot hides a pixel that is never free. There
         targets, video and bare are black, and nothing counts; None: True everywhere.
     :param preference: float32 (B, levels, T), w(t) of Eq. 5 for selection marks and still, of each
@@ -175,11 +177,13 @@ class Pictures:
     :param frames: where they come from; None: the store.
     :param filled: with a robot mask, where targets and video come from.
     :param preference: of every episode of the store w of its frames, (levels, T).
+    :param keyframes: what the third picture of a training is drawn from.
     """
 
     frames: Frames | None = None
     filled: FilledStore | None = None
     preference: Sequence[np.ndarray] | None = None
+    keyframes: 'Keyframes | None' = None
 
 
 def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,

@@ -39,11 +39,14 @@ class Film:
     What the pictures of a demonstration show around each of its frames, at RATE at most.
 
     :param stamps: (T,) s.
-    :param features: (T, D) float64: FEATURES at the times AROUND_S, then the small grey picture.
+    :param features: (T, D) float64: FEATURES at the times AROUND_S, likewise of other cameras, and
+        signals; then the small grey picture of each camera.
+    :param grey: how many of the last columns are those of pictures.
     """
 
     stamps: np.ndarray
     features: np.ndarray
+    grey: int
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -113,7 +116,8 @@ def film(frames: np.ndarray, stamps_ns: np.ndarray, hidden: np.ndarray | None = 
     grey = np.empty((len(index), phases[0].shape[1] - len(FEATURES)))
     for k, phase in enumerate(phases):
         grey[k::step] = phase[:, len(FEATURES):]
-    return Film(stamps, np.concatenate([found[near].reshape(len(index), -1), grey], 1))
+    return Film(stamps, np.concatenate([found[near].reshape(len(index), -1), grey], 1),
+                grey.shape[1])
 
 
 @dataclass(frozen=True)
@@ -151,7 +155,7 @@ class MomentModel:
                               'ten')
         everything = np.concatenate([one.features for one in films])
         self._mean, self._scale = everything.mean(0), 1 / np.maximum(everything.std(0), 1e-6)
-        self._scale[len(FEATURES) * len(AROUND_S):] *= grey
+        self._scale[-films[0].grey:] *= grey
         inputs = [self._inputs(one) for one in films]
         self._weights = np.stack([
             _most_likely(inputs, [spread(one, second[m]) for one, second in zip(films, moments)])

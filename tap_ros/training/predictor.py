@@ -25,6 +25,7 @@ from tap_ros.training.batches import (
     Sampling,
 )
 from tap_ros.training.frames import FilledStore, ResidentFrames
+from tap_ros.training.keyframes import Keyframes
 from tap_ros.training.marks import episode_preferences
 from tap_ros.training.objective import (
     discriminators_loss,
@@ -62,19 +63,24 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
         if config.patience and not len(run.held_out):
             raise ConfigError('patience: nothing is held out to see improvement by; give '
                               '--held-out, a --test-fraction above 0, or leave --patience out')
+        preference, run.about = episode_preferences(run.store, config, run.training)
         network, helpers = make_networks(run)
+        keyframes = None
+        if config.keyframes:
+            assert preference is not None, 'marks label the frames'
+            keyframes = Keyframes(run.store, run.training, preference)
+            network.bank = keyframes.bank(config)
         state = run.begin(network, AVERAGE_DECAY, helpers)
         state.precision = state.precision or pick_precision(config.precision, run.device)
         networks = Networks(state.network, **dict[str, Any](state.helpers.items()),
                             autocast=make_autocast(state.precision, run.device))
-        preference, run.about = episode_preferences(run.store, config, run.training)
         frames, filled = None, None if config.robot_mask == 'none' else FilledStore(
             run.store, config.robot_mask, progress)
         if run.device.type == 'cuda':  # decoding and copying would be most of the time of a step
             frames = ResidentFrames(run.store, run.device, progress)
             if filled is not None:
                 filled.gather = ResidentFrames(filled, run.device, progress)
-        pictures = Pictures(frames, filled, preference)
+        pictures = Pictures(frames, filled, preference, keyframes)
         draw = partial(draw_batch, run.store, run.training, config, pictures)
         state.network.train()
         state.helpers.train()
@@ -109,8 +115,9 @@ def make_networks(run: Run[TrainingConfig],
     vae, longest = config.latent == 'vae', int(run.store.lengths.max())
     shape = PredictorConfig(
         image_size=run.store.image_size[0], base_width=config.base_width,
-        num_context=1 if config.forward else 2, latent_size=LATENT_SIZE if vae else 0,
-        new_pixels=config.new_pixels, decoder=config.decoder, skips=config.skips)
+        num_context=1 if config.forward else 2 + config.keyframes,
+        latent_size=LATENT_SIZE if vae else 0, new_pixels=config.new_pixels,
+        decoder=config.decoder, skips=config.skips)
     network, helpers = PredictorNetwork(shape), dict[str, torch.nn.Module]()
     if config.initial_weights and not run.checkpoint.exists():
         other, _ = load_network(config.initial_weights)
@@ -146,6 +153,10 @@ def draw_batch(store: EpisodeStore, episodes: np.ndarray, config: TrainingConfig
     rng = np.random.default_rng([config.seed, 2, step])
     chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
     batch = make_batch(store, chosen, sampling_of(config), rng, pictures)
+    if pictures.keyframes is not None:
+        third = pictures.keyframes.draw(chosen, rng).to(batch.context.device)
+        batch = replace(batch, context=torch.cat([batch.context, third], 1),
+                        bare=batch.measured)
     return replace(batch, augmentation=Augmentation.draw(
         len(chosen), config.colour, config.brightness, rng))
 

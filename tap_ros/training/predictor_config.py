@@ -46,6 +46,8 @@ class TrainingConfig(RunConfig):
         Start and goal are then drawn around the label.
     :param label_weight: of log w(t) beside the l1 error, with selection marks; w(t) is how likely
         a frame is the label. 0: any of the likeliest frames alike.
+    :param keyframes: the network is also given the labelled frame of the demonstration that is
+        most alike, to copy from; the weights file holds such frames of up to 64 demonstrations.
     :param gan: add the GAN's terms (Eq. 7).
     :param latent: 'vae' adds z (Eq. 9, with a GAN Eq. 10).
     :param fraction: share of the episode at which fix has its target.
@@ -103,6 +105,7 @@ class TrainingConfig(RunConfig):
     selection: Selection = 'progress'
     marks: str = ''
     label_weight: float = 0.01
+    keyframes: bool = False
     gan: bool = False
     latent: Latent = 'none'
     fraction: float = 0.5
@@ -167,6 +170,10 @@ class TrainingConfig(RunConfig):
         if self.marks and (self.min_crop < 1 or self.start_crop):
             raise ConfigError('marks: start and goal are drawn around the label; leave min_crop '
                               'and start_crop out, which draw them anywhere')
+        if self.keyframes and (not self.marks or self.forward or self.new_pixels):
+            raise ConfigError('keyframes: they are the frames that marks label, between a start '
+                              'and a goal, and copied instead of new pixels; give --marks and '
+                              '--no-new-pixels, and leave mode out')
         if self.recursion > 1 and self.loss == 'fix':
             raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
                               'loss fix')

@@ -35,12 +35,14 @@ def save_weights(path: str | Path, module: torch.nn.Module | dict[str, torch.Ten
     Write a network's weights.
 
     :param path: where to; the folder is made. An existing file is replaced in one step.
-    :param module: the network, or its state dict.
+    :param module: the network, with its bank of keyframes if it has one; or its state dict.
     :param kind: what it is: 'predictor', 'forward_model'.
     :param config: the dataclass (or dict) that the network was built from.
     :param training: what made it: data hash, seed, steps, scores. Anything JSON can hold.
     """
     state = module if isinstance(module, dict) else module.state_dict()
+    if (bank := getattr(module, 'bank', None)) is not None:
+        state = {**state, **bank.tensors()}
     values = dict(config) if isinstance(config, Mapping) else asdict(config)
     save_tensors(path, state, {'kind': kind, 'config': values, 'training': training})
 
@@ -67,7 +69,8 @@ def load_weights(path: str | Path,
         if not torch.isfinite(tensor).all():
             raise WeightsError(f'{escaped(path)}: {escaped(name)} holds numbers that are not '
                                'finite; the training has failed, train again')
-    if not any(tensor.any() for tensor in state.values() if tensor.dim() > 1):
+    if not any(tensor.any() for tensor in state.values()
+               if tensor.dim() > 1 and tensor.is_floating_point()):
         raise WeightsError(f'{escaped(path)}: all weights are zero; train again')
     return about['config'], state, about['training']
 

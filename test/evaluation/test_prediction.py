@@ -22,7 +22,9 @@ from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
+from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
+from tap_ros.prediction.retrieval import ends_of
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
@@ -232,10 +234,15 @@ def test_recordings_of_another_camera_are_not_cut_elsewhere_without_a_word(tmp_p
 
 
 @pytest.mark.parametrize('options', [
-    {}, {'latent_size': 8}, {'num_context': 1, 'new_pixels': True}])
+    {}, {'latent_size': 8}, {'num_context': 1, 'new_pixels': True},
+    {'num_context': 3, 'latent_size': 8}])
 def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     bag = write_bag(tmp_path / 'bag', EPISODES)
-    made = network(**options)
+    made, forward = network(**options), options.get('num_context') == 1
+    if options.get('num_context') == 3:
+        made.bank = KeyframeBank.choose(np.stack([
+            ends_of(one.frames[0], one.frames[-1]) for one in EPISODES]),
+            lambda i: EPISODES[i].frames[4])
     weights = tmp_path / 'weights.safetensors'
     save_weights(weights, made, 'predictor', made.config, {'settings': {'test_fraction': 0.0}})
     common = ['--weights', str(weights), '--recordings', str(bag)]
@@ -263,23 +270,23 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     assert hits['random'][1][0] == pytest.approx((5 / 7 + 2 / 7) / 2)
     assert ('best of 3' in shown) == ('latent_size' in options)
     methods = {'prediction', 'copy-start', 'copy-goal'} - (
-        {'copy-goal'} if 'num_context' in options else set())
+        {'copy-goal'} if forward else set())
     assert set(scores) - {'samples'} == methods
     assert all(method in shown for method in methods)
     assert scores['prediction']['episodes'] == 3
     low, high = scores['prediction']['intervals']['min_l1']
     assert low <= scores['prediction']['min_l1'] <= high
     sheet = cv2.imread(str(tmp_path / 'out' / 'pictures.png'))
-    panels = 5 - ('num_context' in options) + ('new_pixels' not in options)
+    panels = 5 - forward + ('new_pixels' not in options)
     assert sheet.shape == (20 + 3 * 130 - 2, panels * 130 - 2, 3)
 
 
 def test_another_predictor_is_scored_by_what_it_shows_and_its_maps(tmp_path, capsys):
-    bag, out = write_bag(tmp_path / 'bag', EPISODES), tmp_path / 'out'
+    bag, out = write_bag(tmp_path / 'bag', EPISODES[:1]), tmp_path / 'out'
     score(['--weights', f'nearest_keyframe:{bag}', '--recordings', str(bag), '--all',
            '--goal-picture', 'last', '--out', str(out)])
     scores = json.loads((out / 'scores.json').read_text())['scores']
-    assert scores['prediction']['min_l1'] < 1e-6  # it has seen these episodes
+    assert scores['prediction']['min_l1'] < 1e-6  # it has seen this episode
     assert scores['prediction']['bottleneck_median'] < scores['copy-goal']['bottleneck_median'] / 2
 
 

@@ -15,7 +15,9 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.predictor.node import PredictorNode
+from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.retrieval import ends_of
 from tap_ros.ros.calls import call
 from tap_ros.ros.topics import encode_image, encode_objects, LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights.weights import save_weights, stored_digest
@@ -40,6 +42,10 @@ ALONE = {'start': START, 'start_objects': START_OBJECTS}
 def weights_file(path, **config):
     """Write weights of an untrained network."""
     network = lively_network(**config)
+    if network.config.num_context == 3:  # of dark scenes
+        shown = np.random.default_rng(2).integers(0, 30, (3, 2, 32, 32, 3), np.uint8)
+        network.bank = KeyframeBank.choose(
+            np.stack([ends_of(*pair) for pair in shown]), lambda i: shown[i, 0])
     save_weights(path, network, 'predictor', network.config, {})
     return path
 
@@ -84,6 +90,7 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp('predictors')
     return {'latent': weights_file(folder / 'latent.safetensors', latent_size=8),
             'forward': weights_file(folder / 'forward.safetensors', num_context=1, latent_size=8),
+            'keyframes': weights_file(folder / 'keyframes.safetensors', num_context=3),
             'plain': weights_file(folder / 'plain.safetensors')}
 
 
@@ -104,6 +111,15 @@ def pictures(response):
 def differ(a, b):
     """Return the mean absolute difference of two pictures, from 0 to 255."""
     return np.abs(a - b).mean()
+
+
+def test_weights_with_keyframes_are_asked_like_others_and_say_what_is_unlike_them(services):
+    response = services['keyframes'].answer(recursion_depth=2, **WITH_GOAL)
+    assert response.message.startswith('bidirectional, 2 subgoals, maps of cup, box; start and ')
+    assert response.message.count('unlike every demonstration') == 1
+    dark = {name: encode_image(picture // 9, STAMP, 'eye')
+            for name, picture in zip(('start', 'goal'), PICTURES)}
+    assert 'unlike' not in services['keyframes'].answer(**WITH_GOAL | dark).message
 
 
 def test_samples_and_levels_are_told_apart_and_repeat_from_the_seed(services):
@@ -165,6 +181,7 @@ def test_answers_are_as_large_as_the_pictures_and_those_of_the_predictor_itself(
     large = dict(zip(('start', 'goal'), (
         encode_image(one, STAMP, 'eye') for one in enlarged_pictures(960))))
     assert [one.image.width for one in service.answer(**large).subgoals] == [960]
+    shown['overlay'].wait(10, lambda m: m.width == m.height == 640)
     many = service.answer(num_samples=20, **large).subgoals
     assert [(one.image.width, one.image.height) for one in many] == 20 * [(32, 32)]
 

@@ -9,7 +9,7 @@ import pytest
 from sim_bridge.simulator import Simulator
 from tap_ros.base.errors import ImageError
 from tap_ros.images.pixels import resize_image, resize_pixels, to_float, to_uint8
-from tap_ros.prediction.fullsize import enlarged
+from tap_ros.prediction.fullsize import enlarged, STEEPER
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.protocol import Request
@@ -51,7 +51,7 @@ def test_flow_and_masks_read_the_full_pictures_as_they_do_the_small_ones(context
     scale = torch.tensor([size[1] / SMALL[1], size[0] / SMALL[0]])[:, None, None]
     expected = combine(
         warp(to_float(sources)[None], wide(made_here.flow[0])[None] * scale),
-        wide(made_here.masks[0])[None],
+        torch.softmax(STEEPER * wide(made_here.masks[0].log()), 0)[None],
         wide(made_here.new_pixels, 'bicubic') if new else None)
     found, = enlarged(made_here, [list(sources)], [size])
     assert found.shape == (*size, 3) and found.dtype == np.uint8
@@ -99,7 +99,7 @@ def test_every_sample_and_level_is_of_the_full_size():
     for one, coarse in zip(found, small, strict=True):
         assert one.image.shape == (96, 96, 3) and coarse.image.shape == (*SMALL, 3)
         assert np.array_equal(one.object_maps, coarse.object_maps)
-        assert np.abs(resize_image(one.image, SMALL).astype(int) - coarse.image).mean() < 4
+        assert np.abs(resize_image(one.image, SMALL).astype(int) - coarse.image).mean() < 6
     (deep, first), (_, second) = found[:2], found[2:4]
     assert np.abs(first.image.astype(int) - second.image).mean() > 2  # another z
     assert np.abs(first.image.astype(int) - deep.image).mean() > 2  # another level

@@ -125,7 +125,7 @@ def test_saved_weights_answer_the_same_and_those_that_predict_nonsense_are_refus
     save_weights(path, network, 'predictor', CONFIG, {})
     with pytest.raises(WeightsError, match='predictor.safetensors: .* damaged'):
         SubgoalPredictor.load(path)
-    video = replace(CONFIG, num_context=3)
+    video = replace(CONFIG, num_context=4)
     save_weights(path, PredictorNetwork(video), 'predictor', video, {})
     with pytest.raises(ConfigError, match='2 context pictures'):
         SubgoalPredictor.load(path)

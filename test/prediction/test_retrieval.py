@@ -10,6 +10,7 @@ from tap_ros.prediction.retrieval import (
     ends_of,
     LARGEST,
     nearest,
+    nearest_others,
     neighbours,
     spread_out,
     unlike,
@@ -51,10 +52,25 @@ def test_of_equally_alike_ones_the_first_is_found_whatever_is_asked_beside_it(en
     assert (indices[20:, 0] == np.arange(20)).all()
     assert (np.diff(indices[:, 1:]) == 20).all()
     many = np.concatenate([ends] * 30)  # more than are compared at once
+    others = np.arange(20)[:, None] + [0, 20, 40]  # the first three that are the same
+    assert (neighbours(many, 3)[0][60:] == np.concatenate([others] * 27)).all()
+    different = np.random.default_rng(0).integers(0, 256, (300, *ends.shape[1:]), np.uint8)
+    assert (neighbours(different, 1)[0][:, 0] != np.arange(300)).all()
     together = nearest(many, ends, 4)
     alone = [nearest(one[None], ends, 4) for one in ends]
     for part, parts in zip(together, zip(*alone)):
         assert (part == np.concatenate([*parts] * 30)).all()
+
+
+def test_what_is_asked_about_is_left_out_where_there_are_others(ends):
+    for one, other in zip(nearest_others(ends, ends, 3), neighbours(ends, 3)):
+        assert (one == other).all()
+    few = ends[:3]
+    indices, distances = nearest_others(ends, few, 5)
+    assert indices.shape == (20, 2)
+    assert (np.sort(indices[:3], 1) == [[1, 2], [0, 2], [0, 1]]).all()
+    assert (indices[3:] == nearest(ends[3:], few, 2)[0]).all() and (distances > 0).all()
+    assert (nearest_others(ends, ends[:1], 5)[0] == 0).all()
 
 
 def test_a_demonstration_that_is_moved_is_still_nearest_to_itself_at_any_size(ends):

@@ -78,8 +78,8 @@ def test_marks_are_the_ends_of_subtasks_and_come_back(truth, tmp_path, capsys):
         0: [(7, 7)], 2: [(3, 3), (10, 10)]}
 
 
-def test_of_another_robot_pictures_are_taken_and_the_rest_is_named(
-        exported, truth, tmp_path, capsys):
+def test_of_another_robot_pictures_and_signals_are_taken_and_the_rest_is_named(
+        exported, truth, tmp_path, capsys, recwarn):
     foreign = shutil.copytree(exported, tmp_path / 'foreign')
     path = foreign / 'meta' / 'info.json'
     info = json.loads(path.read_text())
@@ -93,10 +93,16 @@ def test_of_another_robot_pictures_are_taken_and_the_rest_is_named(
         capsys.readouterr().err)
     assert main(['import-lerobot', str(foreign), '--out', str(tmp_path / 'bag'),
                  '--camera', CAMERA]) == 0
-    assert f'not taken: {ACTION}, observation.images.wrist, {STATE}' in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f'signals: {ACTION}, {STATE}: 11 numbers' in said
+    assert 'not taken: observation.images.wrist' in said
+    told = ' '.join(str(one.message) for one in recwarn)
+    assert '6 signals: ' in told and f'{ACTION} of episode 0' in told  # their shape is wrong
     for new, old in zip(open_recordings(tmp_path / 'bag'), truth, strict=True):
         np.testing.assert_array_equal(new.frames, old.frames)
         assert not new.actions.any() and np.isnan(new.grippers).all() and not new.object_names
+        assert new.signal_names == tuple(f'{STATE}/{name}' for name in 'abcd')
+        np.testing.assert_array_equal(new.signals, old.grippers)
 
 
 def spoil(folder, number=3):

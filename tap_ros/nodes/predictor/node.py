@@ -9,17 +9,20 @@ from pathlib import Path
 import time
 from typing import Any
 
+import cv2
+import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.images.drawing import overlay
+from tap_ros.images.pixels import resize_pixels
 from tap_ros.images.robot_mask import trained_robot_mask
 from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.predictor import requests
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
-from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
+from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files, Request
 from tap_ros.ros.calls import log_error, reason
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.lifecycle import LifecycleBase
@@ -33,7 +36,8 @@ from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 Send = Callable[[PredictSubgoal.Response], object]
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 
-OVERLAY_SIDE = 256  # pixels that subgoal/overlay has a side, about, where the picture has fewer
+# Pixels that subgoal/overlay has on its longer side: at least, about, and at most.
+OVERLAY_SIDE, LARGEST_OVERLAY = 256, 640
 SHOW_PERIOD = 0.1  # s between two checks for a subgoal to publish
 
 
@@ -118,14 +122,11 @@ class PredictorNode(LifecycleBase):
         if not self._unshown:
             return
         task, subgoal, message = self._unshown.pop()
-        request = task.request
         try:
             self._subgoal.publish(message)
             self._picture.publish(message.image)
-            scale = max(1, round(OVERLAY_SIDE / max(request.start.shape)))
-            picture = overlay(request.start, subgoal.object_maps, scale,
-                              request.start_pixels, request.goal_pixels)
-            self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
+            self._overlay.publish(encode_image(
+                draw(task.request, subgoal.object_maps), task.stamp, task.frame_id))
         except Exception as error:
             self._diagnostics.error(error)
             log_error(self, 'subgoal', error)
@@ -181,6 +182,18 @@ def predict(predictor: Predictor, tasks: list[requests.PendingRequest]) -> list[
     found = predictor.predict_together([task.request for task in tasks])
     elapsed_ms = (time.perf_counter() - begin) * 1e3
     return [(subgoals, elapsed_ms) for subgoals in found]
+
+
+def draw(request: Request, object_maps: np.ndarray) -> np.ndarray:
+    """Draw object maps over the start picture of a request, and marks where the objects were."""
+    start, share = request.start, min(1, LARGEST_OVERLAY / max(request.start.shape))
+    size = tuple(max(1, round(share * side)) for side in start.shape[:2])
+    marks = [None if picture is None or pixels is None else resize_pixels(
+        pixels, picture.shape[:2], size) for picture, pixels in (
+            (start, request.start_pixels), (request.goal, request.goal_pixels))]
+    if share < 1:
+        start = np.asarray(cv2.resize(start, size[::-1], interpolation=cv2.INTER_AREA))
+    return overlay(start, object_maps, max(1, round(OVERLAY_SIDE / max(size))), *marks)
 
 
 def declare_parameters(node: Node) -> Parameters:

@@ -6,14 +6,14 @@ Import pictures that stand as arrays in HDF5 files, as of ALOHA and robomimic.
 An array of pictures is (N, H, W, 3 or 4), (N, 3, H, W), or of N JPEG or PNG files, whose bytes may
 be padded. Its last name is the camera, or all names where several end alike, as base_camera/rgb
 and hand_camera/rgb; arrays of one camera in several groups with a number, such as data/demo_7/obs,
-are an episode each, and so is each file.
+are an episode each, and so is each file. Arrays of as many numbers beside them become signals.
 
 Only what is stored in the file itself is read: no links, no arrays that other files hold, and
 nothing that a plug-in has to unpack.
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import count
 import math
@@ -23,7 +23,7 @@ import re
 from typing import Any
 
 import numpy as np
-from tap_ros.base.contract import MAX_PICTURE_BYTES
+from tap_ros.base.contract import MAX_PICTURE_BYTES, MOST_SIGNALS
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.encodings import decompress
@@ -66,7 +66,8 @@ def run(args: Options) -> None:
                 if why := (what_is if file.name.endswith('.zarr.zip') else what_else)(file):
                     raise RecordingError(why)
                 with h5py.File(file, 'r') as root:
-                    arrays = dict(_arrays(root, skipped, Budget(file.stat().st_size)))
+                    budget, beside = Budget(file.stat().st_size), dict[str, Any]()
+                    arrays = dict(_arrays(root, skipped, budget, beside))
                     for name, number in zip(_chosen(arrays, args.camera), numbers):
                         with skipped.errors_of('array', f'{escaped(name)} of {place}'):
                             seconds: list[float] = []
@@ -76,8 +77,11 @@ def run(args: Options) -> None:
                                 at_rate(found, args.rate, seconds),
                                 lambda each: args.cut.image(_picture(each)), skipped,
                                 f'episode {number}')
-                            yield make_episode(
-                                frames, np.array(seconds)[rows], task=args.task, seed=number)
+                            times = np.array(seconds)[rows]
+                            signals = _signals(name, beside, np.rint(times * (
+                                args.fps or FPS)).astype(int), budget)
+                            yield make_episode(frames, times, task=args.task, seed=number,
+                                               **signals)
 
     print(write_bag(args, episodes(), skipped))
 
@@ -104,9 +108,41 @@ def _camera(name: str) -> str:
         r'\d$', group)), last])
 
 
-def _arrays(root: Any, skipped: Skipped,
-            budget: Budget) -> Iterator[tuple[str, Callable[[], Iterable[Any]]]]:
-    """Yield the arrays of pictures in a file: their paths, and what reads them."""
+def _demonstration(name: str) -> str:
+    """Return the path of the group whose number tells an episode, '' of a file that is one."""
+    groups = name.split('/')[:-1]
+    last = max((k for k, group in enumerate(groups, start=1) if 'cam' not in group and re.search(
+        r'\d$', group)), default=0)
+    return '/'.join([*groups[:last], ''])
+
+
+def _signals(name: str, numbers: Mapping[str, Any], rows: np.ndarray,
+             budget: Budget) -> dict[str, Any]:
+    """
+    Return the fields of an Episode with the numbers beside an array of pictures.
+
+    :param name: of the array of pictures.
+    :param numbers: arrays of numbers by their paths.
+    :param rows: (T,), of the pictures that are taken.
+    """
+    place, names, values = _demonstration(name), list[str](), [np.empty((len(rows), 0))]
+    for path in sorted(numbers):
+        array = numbers[path]
+        width = math.prod(array.shape[1:])
+        if (_demonstration(path) == place and len(array) > rows.max()
+                and len(names) + width <= MOST_SIGNALS):
+            budget.take(array.nbytes)
+            values.append(array[:].reshape(len(array), width)[rows])
+            short = escaped(path.removeprefix(place), 60)
+            names += [short] if width == 1 else [f'{short}/{k}' for k in range(width)]
+    with np.errstate(over='ignore'):  # absurd numbers become infinite
+        signals = np.concatenate(values, 1).astype(np.float32)
+    return {'signal_names': tuple(names), 'signals': signals} if names else {}
+
+
+def _arrays(root: Any, skipped: Skipped, budget: Budget, numbers: dict[str, Any],
+            ) -> Iterator[tuple[str, Callable[[], Iterable[Any]]]]:
+    """Yield the arrays of pictures in a file: their paths, and what reads them; note numbers."""
     import h5py
     groups, seen, place = [('', root)], set(), escaped(Path(root.filename).name)
     while groups:
@@ -124,6 +160,8 @@ def _arrays(root: Any, skipped: Skipped,
                     groups.append((f'{path}/', one))
                 elif isinstance(one, h5py.Dataset) and _holds_pictures(one, budget):
                     yield path, partial(_read, one, budget)
+                elif isinstance(one, h5py.Dataset) and _holds_numbers(one):
+                    numbers[path] = one
 
 
 def _read(array: Any, budget: Budget) -> Iterable[Any]:
@@ -143,6 +181,15 @@ def _row(array: Any, row: int, budget: Budget) -> Any:
     values = array[row]
     budget.take(_SHARED * (getattr(values, 'nbytes', 0) or len(values)))
     return values
+
+
+def _holds_numbers(array: Any) -> bool:
+    """Tell whether an array is of some numbers a row, in its own file."""
+    shape = tuple(array.shape or ())
+    return (array.dtype.kind in 'iufb' and len(shape) in (1, 2) and 0 < len(array) <= MOST_FRAMES
+            and 0 < math.prod(shape[1:]) <= MOST_SIGNALS and not array.is_virtual
+            and not array.external and array.id.get_storage_size() > 0
+            and math.prod(array.chunks or ()) <= MOST_FRAMES * MOST_SIGNALS)
 
 
 def _holds_pictures(array: Any, budget: Budget) -> bool:

@@ -5,7 +5,7 @@ Import a LeRobotDataset of version 2 or 3 as recordings.
 
 Pictures of one camera, the task as text, and where subtasks end, as marks. Actions, states and
 objects only of sets that have ours: four numbers called dx, dy, dz and opening, and so on; of
-other robots they would be an arm's command with another meaning.
+other robots they would be an arm's command with another meaning, and are kept as signals.
 
 In such a set meta/info.json describes it, and meta/episodes has a row an episode (v2: a line of
 episodes.jsonl), data a row a frame. Pictures are files in the rows, or videos, of several episodes
@@ -30,8 +30,11 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode, OUTCOMES
 from tap_ros.recording.formats.lerobot_format import (
     ACTION,
+    cut_short,
+    flat_names,
     INDICES,
     INFO,
+    is_depth,
     listed,
     MOST_BYTES,
     NAMES,
@@ -40,6 +43,7 @@ from tap_ros.recording.formats.lerobot_format import (
     OUTCOME,
     read_parquet,
     SEED,
+    signal_names,
     STATE,
     SUBTASK,
     Video,
@@ -48,7 +52,6 @@ from tap_ros.recording.formats.pictures import (
     DAMAGE,
     decoded,
     make_episode,
-    MOST_CHARACTERS,
     Skipped,
     Target,
     write_bag,
@@ -94,6 +97,8 @@ def run(args: Options) -> None:
             i: [(t, t) for t in frames] for i, frames in enumerate(data.marks) if frames})
         print(f'{escaped(path)}: marks where subtasks end, of '
               f'{sum(map(bool, data.marks))} episodes')
+    if data.signals:
+        print(f'signals: {listing(data.signals)}: {sum(map(len, data.signals.values()))} numbers')
     if data.unused:
         print(f'not taken: {listing(data.unused)}')
 
@@ -105,6 +110,7 @@ class DataSet:
     :param folder: of the set.
     :param camera: feature whose pictures are taken; '': the only one of colour.
     :ivar rows: of meta/episodes, dicts in the order of the episodes, in the form of version 3.
+    :ivar signals: names of the numbers of each feature that is kept as signals.
     :ivar unused: features that are not taken over.
     :ivar skipped: what could not be used so far.
     :ivar marks: of each episode so far the last frame of each subtask but the last one.
@@ -124,7 +130,7 @@ class DataSet:
                 info.get('total_episodes', 0))
             cameras = {name: feature for name, feature in self.features.items()
                        if feature['dtype'] in ('image', 'video')}
-            colour = [name for name in cameras if not _is_depth(self.features[name])]
+            colour = [name for name in cameras if not is_depth(self.features[name])]
             self._objects = self._object_names()
         except (OSError, RecordingError) as error:
             raise RecordingError(f'{escaped(self.folder)}: is no LeRobot data set: '
@@ -147,7 +153,8 @@ class DataSet:
         taken = {self.camera, 'timestamp', SUBTASK, *INDICES, *filter(self._is_ours, NAMES)}
         if self._objects:
             taken.add(OBJECTS)
-        self.unused = sorted(self.features.keys() - taken)
+        self.signals = signal_names(self.features, self.features.keys() - taken - cameras.keys())
+        self.unused = sorted(self.features.keys() - taken - self.signals.keys())
         self._starts = self._find_starts() if self.is_video else {}
         self.rows = [row for row in self.rows
                      if row['episode_index'] in self._starts or not self.is_video]
@@ -169,21 +176,13 @@ class DataSet:
         """Whether the pictures are in videos, not in files."""
         return bool(self.features[self.camera]['dtype'] == 'video')
 
-    def _flat_names(self, key: str) -> list[Any]:
-        """Return the names of a feature's numbers; some sets have them in a dict, or none."""
-        names = self.features.get(key, {}).get('names')
-        if isinstance(names, dict):
-            return [name for part in names.values()
-                    for name in (part if isinstance(part, list) else [part])]
-        return names if isinstance(names, list) else []
-
     def _is_ours(self, key: str) -> bool:
         """Return whether the numbers of a feature mean what they do in our recordings."""
-        return self._flat_names(key) == NAMES[key]
+        return flat_names(self.features.get(key)) == NAMES[key]
 
     def _object_names(self) -> tuple[str, ...]:
         """Return the objects whose pixels the set has as we export them."""
-        columns = list(map(str, self._flat_names(OBJECTS)))
+        columns = list(map(str, flat_names(self.features.get(OBJECTS))))
         names = tuple(column.removesuffix('_u') for column in columns[::2])
         return tuple(map(escaped, names)) if object_columns(names) == columns else ()
 
@@ -195,7 +194,7 @@ class DataSet:
                 table = read_parquet(self.folder, file.relative_to(self.folder))
                 for part in table.select([name for name in table.column_names if name.startswith(
                         (*_OF_EPISODES, 'data/', 'videos/'))]).to_batches():
-                    found += map(_cut_short, listed(part))
+                    found += map(cut_short, listed(part))
         if not found and (self.folder / _LINES).exists():
             with self.skipped.errors_of('file', _LINES):
                 found = read_bytes(inside(self.folder, _LINES), MOST_BYTES).splitlines()
@@ -203,7 +202,7 @@ class DataSet:
         for number, one in enumerate(filter(None, found[:_MOST_EPISODES])):
             with self.skipped.errors_of('row', f'{number} of meta/episodes'):
                 row = parse_json(one) if isinstance(one, bytes) else one
-                row = _cut_short(row) | {
+                row = cut_short(row) | {
                     name: int(row[name]) for name in ('episode_index', 'length')}
                 if min(row['episode_index'], row['length'] - 1) < 0:
                     raise ValueError('it counts below zero')
@@ -272,7 +271,7 @@ class DataSet:
 
     def _episode(self, row: dict[str, Any], crop: Crop, rate: float) -> Episode:
         """Return the episode of a row."""
-        part, size = self._rows_of(row), (1, 1)
+        part, size, number = self._rows_of(row), (1, 1), row['episode_index']
         seconds = np.arange(len(part)) / self.fps
         told = np.array(listed(part['timestamp']), float).ravel()
         if (np.abs(told - told[0] - seconds) > 0.5 / self.fps).any() and (np.diff(told) > 0).all():
@@ -289,11 +288,14 @@ class DataSet:
             size = picture.shape[:2]
             return crop.image(picture)
 
-        frames, kept = decoded(cells, decode, self.skipped, f'episode {row["episode_index"]}')
+        frames, kept = decoded(cells, decode, self.skipped, f'episode {number}')
         T = len(kept)
 
         def numbers(key: str, width: int) -> np.ndarray:
-            return np.array(listed(part[key]), np.float32).reshape(-1, width)[kept]
+            values = np.array(listed(part[key]), np.float32).reshape(-1, width)
+            if len(values) != len(part):
+                raise ValueError(f'{escaped(key, 60)} has not {width} numbers a row')
+            return values[kept]
 
         known: dict[str, Any] = {}
         if self._objects:
@@ -303,6 +305,11 @@ class DataSet:
             known['actions'] = np.append(numbers(ACTION, 4)[:-1], np.zeros((1, 4), np.float32), 0)
         if self._is_ours(STATE):
             known['grippers'] = numbers(STATE, 4)
+        for key, own in self.signals.items():
+            with self.skipped.errors_of('signal', f'{escaped(key, 60)} of episode {number}'):
+                known['signals'] = np.concatenate([
+                    known.get('signals', np.empty((T, 0), np.float32)), numbers(key, len(own))], 1)
+                known['signal_names'] = known.get('signal_names', ()) + tuple(own)
         outcome = row.get(OUTCOME, '')
         self.marks.append([])
         if SUBTASK in self.features:
@@ -335,16 +342,3 @@ class DataSet:
                 raise RecordingError(f'{escaped(path)} has no frame at {at:.3f} s')
             return picture
         return times.tolist(), show
-
-
-def _is_depth(feature: dict[str, Any]) -> bool:
-    """Tell whether a feature is of depth by its description."""
-    about = feature.get('info') or {}
-    return any(about.get(name) for name in ('video.is_depth_map', 'is_depth_map'))
-
-
-def _cut_short(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row of meta/episodes with the beginning of its task alone, as text."""
-    tasks = row.get('tasks')
-    return row | {'tasks': str(tasks[0] if isinstance(tasks, list) and tasks else tasks or '')[
-        :MOST_CHARACTERS]}

@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a LeRobotDataset is made of: names, tables and videos."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 import json
 from pathlib import Path
+import re
 from typing import Any
 
 import numpy as np
-from tap_ros.base.contract import GRIPPER_JOINTS
+from tap_ros.base.contract import GRIPPER_JOINTS, MOST_SIGNALS
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.text import escaped
 from tap_ros.recording.bags import what_else
-from tap_ros.recording.formats.pictures import DAMAGE
+from tap_ros.recording.formats.pictures import DAMAGE, MOST_CHARACTERS
 from tap_ros.recording.formats.videos import Show
 from tap_ros.recording.trust import Budget, inside
 
@@ -31,6 +32,47 @@ _BATCH = 256  # rows that are read at once
 def object_columns(names: tuple[str, ...]) -> list[str]:
     """Return the names of the numbers in OBJECTS: u and v of each object."""
     return [f'{name}_{axis}' for name in names for axis in 'uv']
+
+
+def flat_names(feature: Mapping[str, Any] | None) -> list[Any]:
+    """Return the names of a feature's numbers; some sets have them in lists, a dict, or none."""
+    names = (feature or {}).get('names')
+    parts = names.values() if isinstance(names, dict) else names if isinstance(names, list) else []
+    return [name for part in parts for name in (part if isinstance(part, list) else [part])]
+
+
+def signal_names(features: Mapping[str, Any], chosen: Iterable[str]) -> dict[str, list[str]]:
+    """
+    Return the names of the numbers in each feature that has some, MOST_SIGNALS at most.
+
+    :param features: of meta/info.json.
+    :param chosen: names of those that may be taken.
+    """
+    found: dict[str, list[str]] = {}
+    for key in sorted(chosen):
+        shape, kind = features[key].get('shape'), str(features[key].get('dtype'))
+        if not re.fullmatch(r'(float|u?int)\d+|bool', kind) or not isinstance(
+                shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
+            continue
+        count, names = shape[0], flat_names(features[key])
+        names = names if len(names) == count else list(range(min(count, MOST_SIGNALS + 1)))
+        own = [f'{key}/{escaped(name, 60)}' if count > 1 else key for name in names]
+        if 0 < len(own) == len(set(own)) <= MOST_SIGNALS - sum(map(len, found.values())):
+            found[key] = own
+    return found
+
+
+def is_depth(feature: dict[str, Any]) -> bool:
+    """Tell whether a feature is of depth by its description."""
+    about = feature.get('info') or {}
+    return any(about.get(name) for name in ('video.is_depth_map', 'is_depth_map'))
+
+
+def cut_short(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row of meta/episodes with the beginning of its task alone, as text."""
+    tasks = row.get('tasks')
+    return row | {'tasks': str(tasks[0] if isinstance(tasks, list) and tasks else tasks or '')[
+        :MOST_CHARACTERS]}
 
 
 def names_table(key: str, numbers: Mapping[str, int]) -> Any:

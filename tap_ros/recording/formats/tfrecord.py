@@ -4,8 +4,8 @@
 Import episodes from TFRecord files, without TensorFlow: RLDS data sets, and BAIR robot pushing.
 
 A record is an episode. Its pictures are the feature steps/observation/NAME, as RLDS data sets of
-Open X-Embodiment have it, or 0/NAME/encoded, 1/NAME/encoded and so on, as BAIR has them. Pictures
-and the instruction are taken; times are nominal, since records do not tell them.
+Open X-Embodiment have it, or 0/NAME/encoded, 1/NAME/encoded and so on, as BAIR has them. Pictures,
+the instruction and, as signals, floats are taken; times are nominal, as records do not tell them.
 """
 
 from collections import Counter
@@ -24,6 +24,7 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from google.protobuf.unknown_fields import UnknownFieldSet  # type: ignore[import-untyped]
 import google_crc32c
 import numpy as np
+from tap_ros.base.contract import MOST_SIGNALS
 from tap_ros.base.errors import ConfigError, ImageError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.encodings import decompress
@@ -38,6 +39,7 @@ from tap_ros.recording.formats.pictures import (
     write_bag,
 )
 from tap_ros.recording.formats.videos import at_rate
+from tap_ros.recording.metadata import natural
 
 FPS = 5.0  # where nobody says another
 _MOST_RECORD = 2**31  # bytes; those of protobuf have fewer
@@ -61,7 +63,8 @@ def run(args: Options) -> None:
             for record, data in read_records(file, skipped):
                 number, place = next(numbers), f'{record} of {escaped(file.name)}'
                 with skipped.errors_of('record', place):
-                    features = parse_example(data)
+                    floats: dict[str, np.ndarray] = {}
+                    features = parse_example(data, floats)
                     camera = _choose(features, camera)
                     seconds: list[float] = []
                     found = ((row / (args.fps or FPS), each)
@@ -72,8 +75,11 @@ def run(args: Options) -> None:
                     blank[is_blank] += 1
                     said = features.get('steps/language_instruction') or [args.task.encode()]
                     if not is_blank:
+                        times = np.array(seconds)[rows]
                         yield make_episode(
-                            list(map(args.cut.image, frames)), np.array(seconds)[rows],
+                            list(map(args.cut.image, frames)), times, **_signals(
+                                floats, len(_pictures(features, camera)),
+                                np.rint(times * (args.fps or FPS)).astype(int)),
                             task=said[0].decode(errors='replace'), seed=number)
 
     print(f'{write_bag(args, episodes(), skipped)} of {escaped(camera)}')
@@ -119,6 +125,28 @@ def _pictures(features: dict[str, list[bytes]], camera: str) -> list[bytes]:
         while one := features.get(f'{len(together)}/{camera}/encoded'):
             together += one
     return list(together)
+
+
+def _signals(floats: dict[str, np.ndarray], length: int, rows: np.ndarray) -> dict[str, Any]:
+    """
+    Return the fields of an Episode with the floats of a record.
+
+    :param length: steps in the record.
+    :param rows: (T,), of those that are taken.
+    """
+    parts: dict[str, list[np.ndarray]] = {}
+    for name in sorted(floats, key=lambda name: natural(Path(name))):
+        if match := re.fullmatch(r'(?:steps|\d+)/(.+)', name):  # BAIR has a feature a step
+            parts.setdefault(match[1], []).append(floats[name])
+    names, values = list[str](), [np.empty((len(rows), 0), np.float32)]
+    for name, found in sorted(parts.items()):
+        value = np.concatenate(found)
+        width = len(value) // length
+        if 0 < width <= MOST_SIGNALS - len(names) and width * length == len(value):
+            values.append(value.reshape(length, width)[rows])
+            short = escaped(name, 60)
+            names += [short] if width == 1 else [f'{short}/{k}' for k in range(width)]
+    return {'signal_names': tuple(names), 'signals': np.concatenate(values, 1)} if names else {}
 
 
 def _is_picture(data: bytes) -> bool:
@@ -174,20 +202,27 @@ def read_records(path: Path, skipped: Skipped) -> Iterator[tuple[int, bytes]]:
             number += 1
 
 
-def parse_example(data: bytes) -> dict[str, list[bytes]]:
+def parse_example(data: bytes, floats: dict[str, np.ndarray] | None = None,
+                  ) -> dict[str, list[bytes]]:
     """
     Decode one tf.train.Example (or the context of a tf.train.SequenceExample).
 
     :param data: bytes of the message.
+    :param floats: gets the features of floats, (N,) float32 each.
     :return: dict from names to lists of bytes; empty lists of features that hold numbers.
     :raises ValueError: when the bytes are no such message.
     """
     found = {}
     for features in _fields(data).get(1, []):
         for entry in map(_fields, _fields(features).get(1, [])):
-            lists = [one for value in entry.get(2, []) for one in _fields(value).get(1, [])]
-            found[str(entry[1][0], 'utf-8')] = [
-                value for one in lists for value in _fields(one).get(1, [])]
+            kinds, name = [*map(_fields, entry.get(2, []))], str(entry[1][0], 'utf-8')
+            found[name], numbers = ([
+                value for kind in kinds for one in kind.get(number, [])
+                for value in _fields(one).get(1, [])] for number in (1, 2))
+            if floats is not None and numbers:  # packed, or one by one
+                floats[name] = np.concatenate([
+                    np.frombuffer(one if isinstance(one, bytes) else (
+                        one & 0xffffffff).to_bytes(4, 'little'), '<f4') for one in numbers])
     return found
 
 

@@ -1,0 +1,110 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m experiments real`: predictors from a few marks of real demonstrations."""
+
+from dataclasses import dataclass
+import json
+from pathlib import Path
+
+import numpy as np
+from tap_ros.apps.label_command import frames_of
+from tap_ros.apps.train import train
+from tap_ros.base.files import write_atomically
+from tap_ros.base.options import File, Folder, Topic
+from tap_ros.evaluation.hits import seconds_off
+from tap_ros.evaluation.intervals import bootstrap, share_interval
+from tap_ros.evaluation.prediction import evaluate
+from tap_ros.prediction.nearest_keyframe import NearestKeyframe
+from tap_ros.prediction.predictor import load_network
+from tap_ros.recording.bags import reading_like
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import write_marks
+from tap_ros.recording.reading import Reading
+from tap_ros.training.labels import film_of, label, SIZE
+
+WITHIN_S = 0.5, 1.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    It prints, for predictors and for the keyframes of the most alike demonstrations, the error at
+    the moment over copying there, and how often the moment is right, in the held-out ones of all
+    draws.
+
+    :param recordings: one bag folder with all demonstrations.
+    :param truth: JSON file {episode: {"grasp_s": 2.6, ...}}, s from the start of each episode.
+    :param name: the moment.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param marks: demonstrations that are marked in each draw.
+    :param held_out: demonstrations that are scored in each draw.
+    :param draws: how many; draw k has the seed k.
+    :param out: folder of the trainings; those that are done are kept.
+    """
+
+    recordings: Folder
+    truth: File
+    name: str = 'grasp'
+    image_topic: Topic = ''
+    marks: int = 10
+    held_out: int = 10
+    draws: int = 3
+    out: Folder = 'runs/real'
+
+
+def run(options: Options) -> None:
+    """Train and score what is not there yet, and print the table."""
+    truth = json.loads(Path(options.truth).read_text())
+    rows: dict[str, list[np.ndarray]] = {}
+    for draw in range(options.draws):
+        path = Path(options.out, f'{options.name}_{draw}', 'scores.json')
+        if not path.exists():
+            found = score(options, truth, draw, path.parent)
+            write_atomically(path, json.dumps(found) + '\n')
+        for way, values in json.loads(path.read_text()).items():
+            rows.setdefault(way, []).append(np.array(values))
+    within = ' | '.join(f'within {s:g} s' for s in WITHIN_S)
+    print(f'| {options.name}, {options.marks} marks, {options.draws} draws | error at the moment '
+          f'/ copying | {within} |\n|---|---|---|---|')
+    for way, parts in rows.items():
+        error, copying, off = np.concatenate(parts, 1)
+        ratio = bootstrap(lambda a, b: a.mean(-1) / b.mean(-1), error, copying)
+        shares = [share_interval(off <= s + 1e-3) for s in WITHIN_S]
+        print(f'| {way} | {ratio.value:.2f} ({ratio.low:.2f} to {ratio.high:.2f}) | ' + ' | '.join(
+            f'{one.value:.0%} ({one.low:.0%} to {one.high:.0%})' for one in shares) + ' |')
+
+
+def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
+          folder: Path) -> dict[str, list[list[float]]]:
+    """Return of each way the errors at the moment, those of copying there, and how many s off."""
+    whole = open_recordings(options.recordings, reading=Reading(
+        image_topic=options.image_topic, crop='whole', size=SIZE))
+    moments = [np.array([truth[str(i)][f'{options.name}_s']]) for i in range(len(whole))]
+    order = np.random.default_rng(draw).permutation(len(whole)).tolist()
+    held_out = sorted(order[:options.held_out])
+    marked = order[options.held_out:][:options.marks]
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / 'marks.json'
+    write_marks(file, whole, [options.recordings], {
+        i: frames_of(whole, i, moments[i]) for i in marked})
+    weights = train(
+        options.recordings, folder, recipe='foreign', marks=str(file), image_topic=tuple(
+            filter(None, [options.image_topic])), crop='centre', size=SIZE, threads=1, seed=draw,
+        held_out=(f'{options.recordings}:{",".join(map(str, held_out))}',))
+    network, training = load_network(weights)
+    store = open_recordings(options.recordings, reading=reading_like(
+        training, [options.recordings]))
+    labels = label([film_of(whole, i) for i in range(len(whole))], {
+        i: moments[i] for i in marked}, [options.name]).moments
+    alike = NearestKeyframe(store, {
+        i: frames_of(store, i, labels[i]) for i in range(len(store)) if i not in held_out})
+    marks = {i: frames_of(store, i, moments[i]) for i in held_out}
+    found = {}
+    for way, predictor in (('predictor', network), ('most alike keyframes', alike)):
+        scores = evaluate(predictor, store, held_out, 'last', marks=marks)['prediction']
+        found[way] = [scores.at_mark.tolist(), scores.copying_at_mark.tolist(), seconds_off(
+            [marks[i] for i in held_out], [store[i].stamps for i in held_out],
+            scores.match_step).tolist()]
+    return found

@@ -1,0 +1,211 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the third picture: where it comes from, what is copied of it, and hostile files."""
+
+from pathlib import Path
+
+from lively import lively_network
+import numpy as np
+import pytest
+from tap_ros.base.errors import ConfigError, WeightsError
+from tap_ros.evaluation.prediction import evaluate
+from tap_ros.images.drawing import png_bytes
+from tap_ros.images.pixels import resize_image, to_float, to_uint8
+from tap_ros.prediction.keyframe_bank import KeyframeBank, MOST
+from tap_ros.prediction.predictor import load_network, SubgoalPredictor
+from tap_ros.prediction.protocol import Request
+from tap_ros.prediction.retrieval import ends_of, neighbours
+from tap_ros.recording.cache import open_recordings
+from tap_ros.weights.weights import load_tensors, save_tensors, save_weights
+import torch
+
+BAG = Path(__file__).parents[2] / 'bags' / 'sample_push2'
+
+
+@pytest.fixture(scope='module')
+def episodes():
+    return list(open_recordings([BAG], progress=False))
+
+
+@pytest.fixture(scope='module')
+def ends(episodes):
+    return np.stack([ends_of(episode.frames[0], episode.frames[-1]) for episode in episodes])
+
+
+@pytest.fixture(scope='module')
+def bank(episodes, ends):
+    """Keyframes as of a camera of 128 px, of pictures of 64 px."""
+    return KeyframeBank.choose(ends, lambda i: full(episodes[i], 20))
+
+
+def full(episode, t):
+    """Return a frame as a camera of 128 px would show it, not just enlarged."""
+    picture = episode.frames[t].repeat(2, 0).repeat(2, 1)
+    picture[::2, ::2] //= 2
+    return picture
+
+
+@pytest.fixture(scope='module')
+def network(bank):
+    made = lively_network(num_context=3, image_size=64)
+    made.bank = bank
+    return made
+
+
+def ask(predictor, episode, **others):
+    return predictor.predict(episode.frames[0], episode.frames[-1], episode.object_pixels[0],
+                             episode.object_pixels[-1], **others)
+
+
+def test_a_bank_comes_back_from_a_weights_file_as_it_was(network, bank, episodes, tmp_path):
+    save_weights(tmp_path / 'w.safetensors', network, 'predictor', network.config, {'steps': 1})
+    loaded = SubgoalPredictor.load(tmp_path / 'w.safetensors')
+    assert loaded.mode == 'bidirectional' and loaded.training == {'steps': 1}
+    again = load_network(tmp_path / 'w.safetensors')[0].bank
+    assert len(again) == len(bank) == 20
+    for i, keyframe in enumerate(again.keyframes):
+        assert (keyframe == full(episodes[i], 20)).all()
+    one, = ask(SubgoalPredictor(network), episodes[3])
+    other, = ask(loaded, episodes[3])
+    assert (one.image == other.image).all() and one.distance == other.distance > 0
+
+
+def test_a_demonstration_is_shown_its_neighbour_and_never_itself(bank, ends, episodes):
+    pairs = np.stack([episode.frames[[0, -1]] for episode in episodes])
+    indices, distances = bank.find(pairs)
+    others, away = neighbours(ends, 1)
+    assert (indices == others[:, 0]).all() and (distances == away[:, 0]).all()
+    noise = np.random.default_rng(0).integers(0, 256, (1, 2, 64, 64, 3), np.uint8)
+    (_,), (far,) = bank.find(noise)
+    assert bank.unlike(far) and not any(bank.unlike(one) for one in distances)
+    single = KeyframeBank.choose(ends[:1], lambda i: full(episodes[i], 20))
+    assert single.find(pairs)[0].tolist() == [0] * 20
+
+
+def test_the_network_is_given_the_third_picture_by_whoever_asks(network, bank, episodes):
+    predictor = SubgoalPredictor(network)
+    chosen = [1, 4, 7]
+    pairs = np.stack([episodes[i].frames[[0, -1]] for i in chosen])
+    keyframes = [resize_image(bank.keyframes[i], (64, 64)) for i in bank.find(pairs)[0]]
+    context = torch.cat([to_float(pairs), to_float(np.stack(keyframes))[:, None]], 1)
+    with torch.inference_mode():
+        given, found = network(context), network(to_float(pairs))
+    assert given.image.equal(found.image)
+    together = predictor.predict_together([Request(*pair) for pair in pairs])
+    for b, i in enumerate(chosen):
+        alone, = ask(predictor, episodes[i])
+        for shown in (alone.image, together[b][0].image):
+            assert np.abs(shown.astype(int) - to_uint8(given.image)[b]).mean() < 0.1
+    store = open_recordings([BAG], progress=False)
+    as_network, as_predictor = (evaluate(asked, store, chosen)['prediction']
+                                for asked in (network, predictor))
+    assert np.allclose(as_network.min_l1, as_predictor.min_l1, atol=0.002)
+    assert np.allclose(as_network.object_mass, as_predictor.object_mass, atol=0.01)
+
+
+def test_recursion_puts_the_prediction_between_start_and_keyframe(network, bank, episodes):
+    episode = episodes[5]
+    earlier, later = ask(SubgoalPredictor(network), episode, recursion_depth=2)
+    keyframe = bank.scaled((64, 64))[bank.find(episode.frames[None, [0, -1]])[0][0]]
+    with torch.inference_mode():
+        again = network(to_float(np.stack([episode.frames[0], later.image, keyframe]))[None])
+    assert np.abs(earlier.image.astype(int) - to_uint8(again.image)[0]).mean() < 1
+    assert np.abs(earlier.image.astype(int) - later.image).mean() > 3
+    assert earlier.distance == later.distance and not earlier.warning
+
+
+@pytest.fixture
+def copying(bank):
+    """Return a predictor that copies the keyframe, except for the left half: the start."""
+    made = lively_network(num_context=3, image_size=64)
+    made.bank = bank
+    forward = made.forward
+
+    def half(context, z=None):
+        found = forward(context, z)
+        found.flow.zero_()
+        found.masks.zero_()
+        found.masks[:, 0, ..., :32], found.masks[:, 2, ..., 32:] = 1, 1
+        return found
+
+    made.forward = half
+    return SubgoalPredictor(made, {
+        'settings': {'crop': 'centre', 'size': 64}, 'camera_size': [128, 128]})
+
+
+def test_objects_are_where_start_and_goal_are_copied_from(copying, episodes):
+    episode = episodes[0]
+    pixels = np.array([[10, 20], [50, 30]])
+    subgoal, = copying.predict(episode.frames[0], episode.frames[-1], pixels, pixels[::-1])
+    assert subgoal.mass == pytest.approx([1, 0])  # the second is copied from the keyframe
+    assert np.allclose(subgoal.expected_pixels[0], pixels[0], atol=1e-3)
+    assert np.allclose(subgoal.object_maps.sum((1, 2)), 1)
+
+
+def test_the_keyframe_is_copied_at_its_full_size(copying, bank, episodes):
+    start, goal = full(episodes[2], 0), full(episodes[2], -1)
+    subgoal, = copying.predict(start, goal)
+    pair = np.stack([resize_image(one, (64, 64)) for one in (start, goal)])
+    keyframe = bank.keyframes[bank.find(pair[None])[0][0]]
+    assert subgoal.image.shape == (128, 128, 3)
+    assert (subgoal.image[:, 70:] == keyframe[:, 70:]).all()
+    assert (subgoal.image[:, :58] == start[:, :58]).all()
+
+
+def test_a_bank_is_bounded_and_covers_what_it_is_chosen_from(episodes):
+    many = np.random.default_rng(1).integers(0, 256, (150, 2, 16, 16, 3), np.uint8)
+    asked = []
+    bank = KeyframeBank.choose(many, lambda i: asked.append(i) or episodes[i % 20].frames[i % 30])
+    assert len(bank) == MOST == len({*asked[1:]}) == len(asked) - 1  # the first tells the size
+
+
+def test_hostile_banks_are_refused_in_one_line(network, tmp_path):
+    path = tmp_path / 'w.safetensors'
+    save_weights(path, network, 'predictor', network.config, {})
+    tensors, about = load_tensors(path)
+    ends, file = tensors['bank.ends'], tensors['bank.keyframe.3']
+
+    def as_file(width, height):
+        return torch.from_numpy(np.frombuffer(
+            png_bytes(np.zeros((height, width, 3), np.uint8)), np.uint8).copy())
+
+    bomb = as_file(8000, 8000)
+    for changes, said in (
+            ({'bank.ends': ends[:19]}, 'expected 1 to 64'), ({'bank.ends': None}, 'bank.ends'),
+            ({'bank.ends': ends.float()}, 'expected 1 to 64'),
+            ({'bank.ends': ends.bfloat16()}, 'ScalarType'),
+            ({'bank.ends': ends[..., :15, :]}, 'expected 1 to 64'),
+            ({'bank.keyframe.3': None}, 'keyframe'),
+            ({'bank.keyframe.03': file.clone()}, 'keyframe'),
+            ({'bank.keyframe.3': file.float()}, 'bytes of a file'),
+            ({'bank.keyframe.3': file[None]}, 'bytes of a file'),
+            ({'bank.keyframe.3': file[:0]}, 'damaged'),
+            ({'bank.keyframe.3': file[:-500]}, 'damaged'),
+            ({'bank.keyframe.3': as_file(64, 64)}, 'differ in size'),
+            ({'bank.keyframe.3': bomb}, 'are more than'),
+            ({f'bank.keyframe.{n}': file.clone() for n in range(65)} | {
+                'bank.ends': ends[:1].expand(65, -1, -1, -1, -1).contiguous()}, 'expected 1 to'),
+            ({name: None for name in tensors if name.startswith('bank.')}, 'without a bank')):
+        wrong = {name: tensor for name, tensor in {**tensors, **changes}.items()
+                 if tensor is not None}
+        save_tensors(path, wrong, about)
+        with pytest.raises(WeightsError) as error:
+            SubgoalPredictor.load(path)
+        text = str(error.value)
+        assert said in text and text.isprintable() and str(path) in text and len(text) < 400
+
+
+def test_weights_for_two_pictures_have_no_bank(network, bank, tmp_path):
+    two = lively_network(image_size=64)
+    two.bank = bank
+    save_weights(tmp_path / 'two', two, 'predictor', two.config, {})
+    with pytest.raises(WeightsError, match='2 pictures with a bank'):
+        load_network(tmp_path / 'two')
+    with pytest.raises(ConfigError, match='3 with a bank'):
+        SubgoalPredictor(two)
+    with pytest.raises(ConfigError, match='these are for 3'):
+        SubgoalPredictor(lively_network(num_context=3))
+    save_weights(tmp_path / 'zero', {name: 0 * weight for name, weight in {
+        **network.state_dict()}.items()} | bank.tensors(), 'predictor', network.config, {})
+    with pytest.raises(WeightsError, match='all weights are zero'):
+        load_network(tmp_path / 'zero')
