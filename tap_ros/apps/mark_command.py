@@ -21,9 +21,8 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.full_size import FullSize
 from tap_ros.recording.marks import beside
 from tap_ros.recording.reading import Reading, reading_of, ReadingOptions
+from tap_ros.training.labels import SIZE
 from tyro import conf
-
-SMALL = 64  # px a side, of those in the film strip, which labels are found by, too
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def run(args: Options) -> None:
     path = Path(args.marks) if args.marks else beside(args.recordings[0])
     names, reading = parse_names(args.names), reading_of(args.reading)
     store = open_recordings(args.recordings, reading=replace(
-        reading, crop=reading.crop or 'whole', size=SMALL))
+        reading, crop=reading.crop or 'whole', size=SIZE))
     with only_keeper(path), MarkServer(
             Marking(store, args.recordings, path, names), args.port, reading.crop,
             words_of(reading)) as server:

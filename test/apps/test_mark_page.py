@@ -195,7 +195,12 @@ def test_a_gripper_that_was_recorded_proposes_moments(page):
     commands = np.append(one.grippers[1:], np.zeros((1, 4), np.float32), 0)
     assert gripper_moves(replace(one, grippers=unknown, actions=commands)) == [
         (2, True), (5, False)]
-    assert gripper_moves(replace(one, grippers=unknown, actions=unknown)) == []
+    nothing = replace(one, grippers=unknown, actions=unknown)
+    assert gripper_moves(nothing) == []
+    fingers = np.stack([np.arange(len(one)), 2 - one.grippers[:, 3], 3 * one.grippers[:, 3]], 1)
+    assert gripper_moves(replace(
+        nothing, actions=np.zeros_like(one.actions), signals=fingers.astype(np.float32),
+        signal_names=('elbow', 'kHandThumb', 'kHandIndex'))) == [(3, None), (6, None)]
     noise = np.random.default_rng(0).normal(0, 0.01, (len(one), 4)).astype(np.float32)
     assert gripper_moves(replace(one, grippers=noise)) == []
     assert gripper_moves(replace(one, grippers=one.grippers + noise)) == [(3, True), (6, False)]

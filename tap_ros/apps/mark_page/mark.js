@@ -93,7 +93,7 @@ function draw() {
 
 // The ticks of a demonstration: [frame, kind, text].
 function ticks() {
-  return [...about.moves.map(([t, closes]) => [t, 'move', closes ? 'closes' : 'opens']),
+  return [...about.moves.map(([t, closes]) => [t, 'move', closes === null ? 'hand' : closes ? 'closes' : 'opens']),
     ...labels().map(([t], k) => [t, 'label', `${names()[k] || 'label'}?`]),
     ...draft.flatMap((t, k) => t === null ? [] : [[t, isSaved() ? 'mark' : 'draft', nameOf(k)]])];
 }
