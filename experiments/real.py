@@ -5,6 +5,7 @@
 from dataclasses import dataclass
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tap_ros.apps.label_command import frames_of
@@ -23,6 +24,9 @@ from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import film_of, label, SIZE
 
 WITHIN_S = 0.5, 1.0
+WAYS: dict[str, dict[str, Any]] = {  # a name in the table: settings beside those of `foreign`
+    'two pictures, new pixels': {}, 'three pictures, copying': {
+        'keyframes': True, 'new_pixels': False}}
 
 
 @dataclass(frozen=True)
@@ -89,11 +93,14 @@ def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
     file = folder / 'marks.json'
     write_marks(file, whole, [options.recordings], {
         i: frames_of(whole, i, moments[i]) for i in marked})
-    weights = train(
-        options.recordings, folder, recipe='foreign', marks=str(file), image_topic=tuple(
-            filter(None, [options.image_topic])), crop='centre', size=SIZE, threads=1, seed=draw,
-        held_out=(f'{options.recordings}:{",".join(map(str, held_out))}',))
-    network, training = load_network(weights)
+    networks = {}
+    for way, settings in WAYS.items():
+        weights = train(
+            options.recordings, folder / way.split()[0], recipe='foreign', marks=str(file),
+            image_topic=tuple(filter(None, [options.image_topic])), crop='centre', size=SIZE,
+            threads=1, seed=draw, held_out=(
+                f'{options.recordings}:{",".join(map(str, held_out))}',), **settings)
+        networks[way], training = load_network(weights)
     store = open_recordings(options.recordings, reading=reading_like(
         training, [options.recordings]))
     labels = label([film_of(whole, i) for i in range(len(whole))], {
@@ -102,7 +109,7 @@ def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
         i: frames_of(store, i, labels[i]) for i in range(len(store)) if i not in held_out})
     marks = {i: frames_of(store, i, moments[i]) for i in held_out}
     found = {}
-    for way, predictor in (('predictor', network), ('most alike keyframes', alike)):
+    for way, predictor in {**networks, 'most alike keyframes': alike}.items():
         scores = evaluate(predictor, store, held_out, 'last', marks=marks)['prediction']
         found[way] = [scores.at_mark.tolist(), scores.copying_at_mark.tolist(), seconds_off(
             [marks[i] for i in held_out], [store[i].stamps for i in held_out],
