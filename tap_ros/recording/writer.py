@@ -228,8 +228,8 @@ class EpisodeWriter:
     def __init__(self, path: str | Path, compression: str = 'zstd',
                  camera_matrix: ArrayLike | None = None, jpeg: bool = False) -> None:
         self._jpeg = jpeg
-        self._stack = ExitStack()
-        self._file = self._stack.enter_context(new_file(path, compression))
+        self.path, self._stack = Path(path), ExitStack()
+        self._file = self._stack.enter_context(new_file(self.path, compression))
         self._camera_matrix = np.zeros((3, 3)) if camera_matrix is None else np.asarray(
             camera_matrix, float)
         self._last_log: int | None = None
