@@ -227,6 +227,7 @@ class EpisodeWriter:
 
     def __init__(self, path: str | Path, compression: str = 'zstd',
                  camera_matrix: ArrayLike | None = None, jpeg: bool = False) -> None:
+        self.path = Path(path)
         self._jpeg = jpeg
         self.path, self._stack = Path(path), ExitStack()
         self._file = self._stack.enter_context(new_file(self.path, compression))

@@ -163,7 +163,8 @@ class MomentModel:
         gaps = np.diff(np.stack(moments), axis=1)  # (N, M - 1) s
         self._gap = gaps.mean(0)
         wide = gaps.var(0, ddof=1) if len(gaps) > 1 else np.full(len(self._gap), math.inf)
-        self._gap_deviation = np.sqrt(wide * (1 + 1 / len(gaps)) + LEAST_GAP_S ** 2)  # XX
+        least = LEAST_GAP_S * float(np.mean([one.pace for one in films]))
+        self._gap_deviation = np.sqrt(wide * (1 + 1 / len(gaps)) + least ** 2)
 
     def log_posterior(self, one: Film) -> np.ndarray:
         """Return log of the posterior of each mark and frame, (M, T), all marks in their order."""

@@ -213,10 +213,10 @@ RECIPES = {  # the first stands for recordings of other tasks
     'pick_place': replace(_GRIPPING, steps=10000),
     'pick_place_vae': replace(
         _GRIPPING, selection='absolute', latent='vae', margin=0, kl_weight=2e-5, free_nats=4.0),
-    # A dozen marked demonstrations, see marks. Pieces without the marked moment teach another
-    # one, and it may be three frames from the goal. As above, gripping hands must be made up.
+    # A dozen marked demonstrations, see marks. The moment may be three frames from the goal. As
+    # above, gripping hands must be made up.
     'foreign': replace(_BY_COPYING, margin=1, start_crop=0.0, new_pixels=True, colour=False,
-                       brightness=0.0, steps=400, batch_size=8),
+                       brightness=0.0, steps=800, batch_size=8),
     # Ten steps, to see whether recordings can be trained on.
     'debug': replace(_PUSH, steps=10, batch_size=4, test_fraction=0.3, threads=1, base_width=4,
                      precision='float32')}

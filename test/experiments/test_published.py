@@ -6,7 +6,7 @@ from io import StringIO
 import json
 import re
 
-from experiments import few, tables, tracking
+from experiments import few, fullsize, tables, tracking
 from experiments.paper import published
 from experiments.paper import rows as rows_of_scores
 from experiments.paper.results import load_runs, on_same_episodes
@@ -44,7 +44,8 @@ def test_pages_are_made_from_the_data():
         return json.loads((RESULTS / f'{name}.json').read_text())
 
     for name, page in (
-            ('few', few.page(rows('few'))), ('worlds', command.page(rows('worlds'))),
+            ('few', few.page(rows('few'))), ('fullsize', fullsize.page(rows('fullsize'))),
+            ('worlds', command.page(rows('worlds'))),
             ('tracking', tracking.page(rows('tracking'), tracking.loop(RESULTS / 'tracking')))):
         assert page == (RESULTS / f'{name}.md').read_text(), name
 

@@ -65,3 +65,16 @@ def test_files_functions_and_tests_that_are_named_exist(page):
         for word in filter(None, re.split('[., ]+', inside)):
             assert any(re.search(rf'\b(?:def|class) {word}\b|^{word} = ', path.read_text(), re.M)
                        for path in files), f'{name} has no {word}'
+
+
+def test_each_step_of_the_ways_is_where_the_page_says():
+    text, steps = (ROOT / 'docs/architecture.md').read_text(), 0
+    for block in re.findall(r'^```\n(.*?)^```$', text, re.M | re.S):
+        for said, place in re.findall(r'^ *(?:-> )?(\S.*?) {2,}([\w/]+\.py)', block, re.M):
+            source = (ROOT / place).read_text()
+            names = re.match(r'((?:[A-Za-z_][\w.]*)(?:, [A-Za-z_]\w*)*):', said)
+            for name in re.split(r'[., ]+', names.group(1)) if names else ():
+                assert re.search(rf'^\s*(?:def|class) {name}\b|^{name} = ', source, re.M), (
+                    name, place)
+                steps += 1
+    assert steps > 20
