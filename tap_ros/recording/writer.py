@@ -229,8 +229,8 @@ class EpisodeWriter:
                  camera_matrix: ArrayLike | None = None, jpeg: bool = False) -> None:
         self.path = Path(path)
         self._jpeg = jpeg
-        self._stack = ExitStack()
-        self._file = self._stack.enter_context(new_file(path, compression))
+        self.path, self._stack = Path(path), ExitStack()
+        self._file = self._stack.enter_context(new_file(self.path, compression))
         self._camera_matrix = np.zeros((3, 3)) if camera_matrix is None else np.asarray(
             camera_matrix, float)
         self._last_log: int | None = None
