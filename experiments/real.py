@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m experiments real`: predictors from a few marks of real demonstrations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from tap_ros.apps.label_command import frames_of
 from tap_ros.apps.train import train
@@ -15,8 +16,10 @@ from tap_ros.base.options import File, Folder, Topic
 from tap_ros.evaluation.hits import seconds_off
 from tap_ros.evaluation.intervals import bootstrap, share_interval
 from tap_ros.evaluation.prediction import evaluate
+from tap_ros.images.drawing import grid
 from tap_ros.prediction.nearest_keyframe import NearestKeyframe
-from tap_ros.prediction.predictor import load_network
+from tap_ros.prediction.predictor import load_network, SubgoalPredictor
+from tap_ros.prediction.protocol import Request
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
@@ -24,6 +27,7 @@ from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import film_of, label, SIZE
 
 WITHIN_S = 0.5, 1.0
+ROWS = 6  # demonstrations that are drawn
 WAYS: dict[str, dict[str, Any]] = {  # a name in the table: settings beside those of `foreign`
     'two pictures, new pixels': {}, 'three pictures, copying': {
         'keyframes': True, 'new_pixels': False}}
@@ -70,6 +74,8 @@ def run(options: Options) -> None:
         for way, values in json.loads(path.read_text()).items():
             rows.setdefault(way, []).append(np.array(values))
     within = ' | '.join(f'within {s:g} s' for s in WITHIN_S)
+    image = sheet(options, truth)
+    cv2.imwrite(str(Path(options.out, f'{options.name}.jpg')), image[..., ::-1])
     print(f'| {options.name}, {options.marks} marks, {options.draws} draws | error at the moment '
           f'/ copying | {within} |\n|---|---|---|---|')
     for way, parts in rows.items():
@@ -78,6 +84,28 @@ def run(options: Options) -> None:
         shares = [share_interval(off <= s + 1e-3) for s in WITHIN_S]
         print(f'| {way} | {ratio.value:.2f} ({ratio.low:.2f} to {ratio.high:.2f}) | ' + ' | '.join(
             f'{one.value:.0%} ({one.low:.0%} to {one.high:.0%})' for one in shares) + ' |')
+
+
+def sheet(options: Options, truth: dict[str, dict[str, float]]) -> np.ndarray:
+    """
+    Draw held-out demonstrations of the first draw at the camera's resolution.
+
+    Columns: start, goal, what each predictor shows, and the frame of the moment.
+    """
+    folder = Path(options.out, f'{options.name}_0')
+    predictors = [SubgoalPredictor(*load_network(
+        folder / way.split()[0] / 'predictor.safetensors')) for way in WAYS]
+    order = np.random.default_rng(0).permutation(len(truth)).tolist()
+    store = open_recordings(options.recordings, reading=replace(reading_like(
+        predictors[0].training, [options.recordings]), size=0))
+    rows = []
+    for i in sorted(order[:options.held_out])[:ROWS]:
+        frames = store.frames(i)
+        (at, _), = frames_of(store, i, np.array([truth[str(i)][f'{options.name}_s']]))
+        request = Request(frames[0], frames[-1])
+        rows.append([frames[0], frames[-1], *(
+            one.predict_together([request])[0][0].image for one in predictors), frames[at]])
+    return grid(rows)
 
 
 def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
