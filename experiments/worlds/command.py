@@ -36,7 +36,6 @@ from tap_ros.recording.marks import read_marks
 from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import film, fit, moments_of
 from tap_ros.training.marks import chance
-from tap_ros.training.predictor_config import RECIPES
 
 Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
@@ -228,5 +227,4 @@ def page(rows):
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
     return render('worlds/templates/worlds.md.j2', marked=MARKED, held_out=HELD_OUT,
                   seeds=seeds['trained'], seeds_aside=seeds['aside'].get('marks'),
-                  settings=RECIPES[SETTINGS['recipe']],
                   **{kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})
