@@ -95,10 +95,9 @@ def sheet(options: Options, truth: dict[str, dict[str, float]]) -> np.ndarray:
     folder = Path(options.out, f'{options.name}_0')
     predictors = [SubgoalPredictor(*load_network(
         folder / way.split()[0] / 'predictor.safetensors')) for way in WAYS]
-    order = np.random.default_rng(0).permutation(len(truth)).tolist()
     store = open_recordings(options.recordings, reading=replace(reading_like(
         predictors[0].training, [options.recordings]), size=0))
-    rows = []
+    order, rows = np.random.default_rng(0).permutation(len(store)).tolist(), []
     for i in sorted(order[:options.held_out])[:ROWS]:
         frames = store.frames(i)
         (at, _), = frames_of(store, i, np.array([truth[str(i)][f'{options.name}_s']]))

@@ -3,15 +3,13 @@
 """The third picture of a training: labelled frames of the demonstrations that are most alike."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from tap_ros.base.errors import ImageError
 from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.retrieval import ends_of, neighbours
-from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.reading import reading_of
-from tap_ros.training.run import bags_of
+from tap_ros.recording.full_size import FullSize
 import torch
 
 if TYPE_CHECKING:
@@ -31,7 +29,7 @@ class Keyframes:
 
     def __init__(self, store: 'EpisodeStore', episodes: np.ndarray,
                  preference: Sequence[np.ndarray]) -> None:
-        self._episodes = episodes
+        self._store, self._episodes = store, episodes
         self._labels = [int(preference[i][0].argmax()) for i in episodes.tolist()]
         self._ends = np.stack([ends_of(*store.frames(i)[[0, -1]]) for i in episodes.tolist()])
         self._near = (neighbours(self._ends, NEIGHBOURS)[0] if len(episodes) > 1
@@ -47,7 +45,12 @@ class Keyframes:
 
     def bank(self, config: 'TrainingConfig') -> KeyframeBank:
         """Return the bank that goes with the weights, of pictures at the recorded size."""
-        store = open_recordings(bags_of(config), progress=False, reading=replace(
-            reading_of(config), size=0))
-        return KeyframeBank.choose(self._ends, lambda n: np.array(
-            store.frames(int(self._episodes[n]))[self._labels[n]]))
+        full = FullSize(self._store, config.crop)
+
+        def shown(n: int) -> np.ndarray:
+            return full.picture(int(self._episodes[n]), self._labels[n])
+
+        try:
+            return KeyframeBank.choose(self._ends, shown)
+        except ImageError:  # some cannot be read one by one, or cameras differ
+            return KeyframeBank.choose(self._ends, lambda n: self._pictures[n].numpy())

@@ -27,10 +27,10 @@ from tap_ros.recording.topic_choice import Bag
 from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.training.run_config import RunConfig
 from tap_ros.training.split import (
+    describe_split,
     digests_of,
     parse_held_out,
     split_episodes,
-    tell,
     warn_if_few,
     with_masks,
 )
@@ -108,7 +108,7 @@ class Run(Generic[Config]):
             raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
                                  'that is long enough by itself; name whole bags, not files of '
                                  'a split one, or demonstrations: BAG:7')
-        print(tell(self.held_out, self.training, marked), file=sys.stderr)
+        print(describe_split(self.held_out, self.training, marked), file=sys.stderr)
         warn_if_few(self.held_out)
         digests = digests_of(self.store)
         self._held_out_digests = sorted({digests[i] for i in self.held_out})

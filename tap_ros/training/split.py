@@ -119,12 +119,12 @@ def parse_held_out(text: str | Path) -> tuple[Path, list[tuple[int, int]]]:
     return Path(path), [(both[0], both[-1]) for both in ends]
 
 
-def tell(held_out: np.ndarray, training: np.ndarray, marked: Collection[int]) -> str:
+def describe_split(held_out: np.ndarray, training: np.ndarray, marked: Collection[int]) -> str:
     """Return in words what a training holds out, with its numbers in the order of recordings."""
-    both = len(held_out) + len(training)
-    lost = len(set(marked) & set(held_out.tolist()))
-    marks = f', {lost or "none"} of {len(marked)} marked' if marked else ''
-    return f'held out: {len(held_out)} of {both} episodes{marks}: {listing(held_out, 20)}'
+    count = len(held_out) + len(training)
+    unused = len(set(marked) & set(held_out.tolist()))
+    marks = f', {unused or "none"} of {len(marked)} marked' if marked else ''
+    return f'held out: {len(held_out)} of {count} episodes{marks}: {listing(held_out, 20)}'
 
 
 def _usable(store: 'EpisodeStore', min_frames: int = 3) -> list[int]:

@@ -12,7 +12,7 @@ from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.forward_config import ForwardTrainingConfig
 from tap_ros.training.run import bags_of
-from tap_ros.training.split import digests_of, split_as_trained, split_episodes, tell
+from tap_ros.training.split import describe_split, digests_of, split_as_trained, split_episodes
 
 CRC32 = [3, 4, 5, 6, 7, 19, 29, 39, 49, 59]  # of 60 scenes, where 30% were asked for
 
@@ -63,7 +63,7 @@ def test_marked_demonstrations_are_held_out_only_when_no_others_are_left():
     cameras = Store([0] * 24, times=[i // 2 for i in range(24)])  # a mark in one of two cameras
     assert {0, 1, 2, 3} <= {*split_episodes(cameras, 0.8, marked=[0, 3])[0]}
     training, held_out = split_episodes(Store(range(40)), 0.5, marked=range(10))
-    assert tell(held_out, training, range(10)).startswith(
+    assert describe_split(held_out, training, range(10)).startswith(
         'held out: 20 of 40 episodes, none of 10 marked: 1')
 
 
