@@ -97,8 +97,8 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
     model, left_out = fit(of_chosen, list(moments.values()))
     order = slice(None) if config.forward else slice(None, None, -1)
     about = [_worth(of_chosen, np.array(true), np.array(guess)) for true, guess in zip(
-        np.transpose(list(moments.values())), np.transpose(left_out or []) if left_out
-        else [()] * config.recursion)][order]
+        np.transpose(list(moments.values())),
+        np.transpose(left_out) if left_out else [()] * config.recursion)][order]
     labels: list[np.ndarray | None] = []
     for i, one in enumerate(films):
         if one is None:
