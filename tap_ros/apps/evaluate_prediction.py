@@ -25,8 +25,8 @@ from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
 from tap_ros.recording.bags import find_bags, reading_like
-from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.marks import read_marks
+from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.marks import Marks, read_marks
 from tap_ros.training.frames import FilledStore
 from tap_ros.training.split import split_as_trained, TEST_FRACTION, warn_if_few, with_masks
 from tap_ros.weights import PREDICTORS
@@ -100,8 +100,7 @@ def run(args: Options) -> None:
         raise ConfigError('recordings: no episode of them was held out from training; '
                           'give more of them, or --all')
     marks = read_marks(args.marks, store) if args.marks else None
-    marked = [n for n, i in enumerate(episodes.tolist()) if marks and i in marks.episodes]
-    if marks and not marked:
+    if marks and marks.episodes.keys().isdisjoint(episodes.tolist()):
         raise ConfigError(
             'marks: none of the episodes that are scored is marked; mark some of them, in the '
             f'order of the recordings from 0: {listing(episodes)}; or give --all')
@@ -124,20 +123,7 @@ def run(args: Options) -> None:
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
     if marks:
-        chosen, mine = episodes[marked].tolist(), scores['prediction']
-        known, matched = [marks.episodes[i] for i in chosen], mine.match_step[marked]
-        about['marks'] = score_hits(known, store.lengths[chosen], matched)
-        print(f'the matched frame is a marked one, or within one frame of it, in {len(marked)} '
-              'marked episodes:')
-        for name, hits in about['marks'].items():
-            print(f'{name:22s}' + ''.join(f'{_percent(one):>20s}' for one in hits))
-        off = seconds_off(known, [store[i].stamps for i in chosen], matched)
-        within = [share_interval(off <= s + 1e-6) for s in WITHIN_S]
-        word, ratio = against_copying(mine.at_mark[marked], mine.copying_at_mark[marked])
-        print(f'the matched frame is within {", ".join(f"{s:g}" for s in WITHIN_S)} s of a mark: '
-              f'{", ".join(map(_percent, within))}\nerror at the mark: {word}; {ratio.value:.2f} '
-              f'times copying there ({ratio.low:.2f}, {ratio.high:.2f})')
-        about['marks'] |= {'seconds': within, 'error': ratio}
+        about['marks'] = _score_marks(store, episodes, marks, scores['prediction'])
     if isinstance(network, PredictorNetwork) and network.config.latent_size:
         drawn = score_samples(network, store, episodes, args.goal_picture, args.samples, filled)
         about['samples'] = {'count': args.samples}
@@ -157,6 +143,26 @@ def run(args: Options) -> None:
         write_atomically(Path(args.out, 'scores.json'), json.dumps(result, indent=2) + '\n')
         write_atomically(Path(args.out, 'pictures.png'), png_bytes(draw_strips(
             network, store, episodes[:_STRIPS], args.goal_picture, filled, marks)))
+
+
+def _score_marks(store: EpisodeStore, episodes: np.ndarray, marks: Marks,
+                 scores: EpisodeScores) -> dict[str, Any]:
+    """Print and return how often the moment of predictions is right, and the errors at marks."""
+    marked = [n for n, i in enumerate(episodes.tolist()) if i in marks.episodes]
+    chosen, matched = episodes[marked].tolist(), scores.match_step[marked]
+    known = [marks.episodes[i] for i in chosen]
+    found = score_hits(known, store.lengths[chosen], matched)
+    print(f'the matched frame is a marked one, or within one frame of it, in {len(marked)} marked '
+          'episodes:')
+    for name, hits in found.items():
+        print(f'{name:22s}' + ''.join(f'{_percent(one):>20s}' for one in hits))
+    off = seconds_off(known, [store[i].stamps for i in chosen], matched)
+    within = [share_interval(off <= s + 1e-6) for s in WITHIN_S]
+    word, ratio = against_copying(scores.at_mark[marked], scores.copying_at_mark[marked])
+    print(f'the matched frame is within {", ".join(f"{s:g}" for s in WITHIN_S)} s of a mark: '
+          f'{", ".join(map(_percent, within))}\nerror at the mark: {word}; {ratio.value:.2f} '
+          f'times copying there ({ratio.low:.2f}, {ratio.high:.2f})')
+    return {**found, 'seconds': within, 'error': ratio}
 
 
 def _print_table(scores: Mapping[str, EpisodeScores], goal_picture: str,

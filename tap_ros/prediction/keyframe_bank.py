@@ -132,6 +132,9 @@ class KeyframeBank:
 
     def completed(self, context: torch.Tensor) -> torch.Tensor:
         """Return contexts (B, 2, 3, H, W) in [-1, 1] with the keyframe as the third picture."""
-        pictures = to_uint8(context)
-        keyframes = self.scaled(pictures.shape[2:4])[self.find(pictures)[0]]
+        return self.beside(context, self.find(to_uint8(context))[0])
+
+    def beside(self, context: torch.Tensor, indices: np.ndarray) -> torch.Tensor:
+        """Return contexts (B, 2, 3, H, W) with the keyframes of indices (B,) as third pictures."""
+        keyframes = self.scaled(tuple(context.shape[-2:]))[indices]
         return torch.cat([context, to_float(keyframes).to(context.device)[:, None]], 1)

@@ -124,11 +124,11 @@ class SubgoalPredictor(Predictor):
         sizes = [answer_size(pictures) for pictures in sources]
         said: list[dict[str, Any]] = [{} for _ in requests]
         if (bank := self._network.bank) is not None:  # one keyframe for all levels of a request
-            context = bank.completed(context)
             numbers, distances = bank.find(np.stack([pictures for pictures, _ in scenes]))
             said = [{'distance': distance, 'warning': bank.unlike(distance)}
                     for distance in distances.tolist()]
-            shown = np.repeat(numbers, counts).tolist()
+            shown = np.repeat(numbers, counts)
+            context = bank.beside(context, shown)
             sources = [[*pictures, bank.keyframes[i]] for pictures, i in zip(sources, shown)]
         maps = _join([  # rows, C, K, H, W
             one_hot_maps(torch.from_numpy(pixels).to(self._device), self.image_size).expand(

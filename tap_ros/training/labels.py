@@ -82,9 +82,10 @@ class Film:
         return int(np.clip(np.abs(self.stamps - second).argmin(), 1, len(self) - 2))
 
 
-def film_of(store: 'EpisodeStore', i: int) -> Film | None:
-    """Describe a demonstration of a store; None for one that is too short."""
-    return None if store.lengths[i] < LEAST_FRAMES else film(store.frames(i), store[i].stamps)
+def film_of(store: 'EpisodeStore', i: int, hidden: np.ndarray | None = None) -> Film | None:
+    """Describe a demonstration of a store, see film; None for one that is too short."""
+    return None if store.lengths[i] < LEAST_FRAMES else film(
+        store.frames(i), store[i].stamps, hidden)
 
 
 def film(frames: np.ndarray, stamps_ns: np.ndarray, hidden: np.ndarray | None = None) -> Film:

@@ -13,7 +13,7 @@ from tap_ros.images.robot_mask import hidden_pixels, RobotMask
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import Mark, Marks, read_marks
 from tap_ros.recording.reading import reading_of
-from tap_ros.training.labels import Film, film, fit, SIZE, spread
+from tap_ros.training.labels import Film, film_of, fit, SIZE, spread
 from tap_ros.training.preference import describe, LEAST_FRAMES, still
 from tap_ros.training.run import bags_of
 
@@ -87,9 +87,7 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
                 f'marks: demonstration {i} has {len(marks.episodes[i])}, and each needs '
                 f'{config.recursion}, one for a level of recursion; mark as many, or give '
                 '--recursion')
-    films = [None if store.lengths[i] < LEAST_FRAMES else film(
-        store.frames(i), store[i].stamps, hidden_of(store, i, config.robot_mask))
-        for i in range(len(store))]
+    films = [film_of(store, i, hidden_of(store, i, config.robot_mask)) for i in range(len(store))]
     moments = {i: np.array([
         store[i].stamps[(first + last) // 2] - store[i].stamps[0]
         for first, last in marks.episodes[i]]) / 1e9 for i in chosen}

@@ -236,8 +236,7 @@ def _recursive_loss(networks: Networks, targets: Targets, prediction: Prediction
         # The prediction takes the place of the start (forward) or of the goal.
         following = prediction.image[:, None].detach()
         context, measured = (
-            following if config.forward else torch.cat(
-                [pictures[:, :1], following, pictures[:, 2:]], 1)
+            following if config.forward else torch.cat([pictures[:, :1], following], 1)
             for pictures in (context, measured))
         prediction = networks.predict(context, z)
         # Preferences lie between the inputs of this level.

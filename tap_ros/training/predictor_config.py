@@ -170,10 +170,11 @@ class TrainingConfig(RunConfig):
         if self.marks and (self.min_crop < 1 or self.start_crop):
             raise ConfigError('marks: start and goal are drawn around the label; leave min_crop '
                               'and start_crop out, which draw them anywhere')
-        if self.keyframes and (not self.marks or self.forward or self.new_pixels):
-            raise ConfigError('keyframes: they are the frames that marks label, between a start '
-                              'and a goal, and copied instead of new pixels; give --marks and '
-                              '--no-new-pixels, and leave mode out')
+        if self.keyframes and (not self.marks or self.forward or self.new_pixels
+                               or self.recursion > 1):
+            raise ConfigError('keyframes: they are the frames that one mark labels, between a '
+                              'start and a goal, and copied instead of new pixels; give --marks '
+                              'and --no-new-pixels, and leave mode and recursion out')
         if self.recursion > 1 and self.loss == 'fix':
             raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
                               'loss fix')

@@ -68,7 +68,8 @@ def test_weights_hold_the_keyframes_of_the_training_and_answer_with_them(store, 
 
 
 @pytest.mark.parametrize('values', [
-    {'new_pixels': True}, {'mode': 'forward'}, {'selection': 'relative', 'marks': ''}])
+    {'new_pixels': True}, {'recursion': 2}, {'mode': 'forward'},
+    {'selection': 'relative', 'marks': ''}])
 def test_keyframes_go_with_marks_and_copying_alone(config, values):
     with pytest.raises(ConfigError, match='^keyframes'):
         replace(config, **values).check()
