@@ -10,6 +10,7 @@ import secrets
 import threading
 import time
 from typing import Any
+from weakref import WeakValueDictionary
 
 from action_msgs.msg import GoalInfo, GoalStatus
 from action_msgs.srv import CancelGoal
@@ -30,6 +31,7 @@ CANCEL = f'{ACTION}/_action/cancel_goal'
 CLIENT = 'tap_ros_client_'  # begins the name of a Client's own node
 ANSWER_S = 5.0  # until an answer to a goal is held to be lost, and the goal is sent anew
 CANCEL_S = 1.0  # until a cancel that is not answered is sent again
+LATE_S = 1.0  # that feedback may come after the result
 CLOSE_S = 5.0  # that cancelling may take when a client ends: more than a dead planner's lease
 ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_CANCELED: 'cancelled',
         GoalStatus.STATUS_ABORTED: 'aborted'}
@@ -51,6 +53,10 @@ class Goals:
         self.node, self.server = node, server
         self.action = ActionClient(node, ReachGoal, ACTION, callback_group=group)
         self.cancels = node.create_client(CancelGoal, CANCEL, callback_group=answers)
+        # rclpy's action client drops feedback that comes with the result.
+        node.create_subscription(ReachGoal.Impl.FeedbackMessage, FEEDBACK, self._take_feedback, 10,
+                                 callback_group=group)
+        self.sent = WeakValueDictionary[bytes, Reaching]()  # by their ids
         self.open: set[Reaching] = set()  # that have not ended
         self.given_up, self.closed = threading.Event(), threading.Event()
         threading.Thread(target=self._cancel, name='cancelling', daemon=True).start()
@@ -74,6 +80,10 @@ class Goals:
             time.sleep(POLL_S)
         self.closed.set()
         self.given_up.set()
+
+    def _take_feedback(self, message: Any) -> None:
+        if goal := self.sent.get(bytes(message.goal_id.uuid)):
+            goal.take(message.feedback)
 
     def _cancel(self) -> None:
         while not self.closed.wait(POLL_S):
@@ -134,6 +144,7 @@ class Reaching:
         self.given_up = self._sent_anew = False
         self._accepted: Future | None = None  # once it was sent
         self._answer: Future | None = None
+        self._answered = 0.0  # when
         self._presence: Presence | None = None  # of the planner that it was sent to
         if goals.closed.is_set():
             raise CallError(f'{self._name}: the client was closed')
@@ -145,7 +156,8 @@ class Reaching:
             raise
 
     def __iter__(self) -> Iterator[Any]:
-        while not (self._feedback.empty() and self._is_over()):
+        step = 0
+        while not (self._feedback.empty() and self._is_over(step)):
             try:
                 feedback = self._feedback.get(timeout=POLL_S)
             except Empty:
@@ -153,6 +165,7 @@ class Reaching:
             except BaseException:
                 self.cancel()
                 raise
+            step = feedback.step
             yield feedback
         self.result()  # raises what has ended it
 
@@ -231,7 +244,7 @@ class Reaching:
                                 f'{self._server.name} says why')
             time.sleep(CANCEL_S)  # the one whose answer was lost has yet to end
         self._answer = self._in_executor(accepted.get_result_async, deadline)
-        self._answer.add_done_callback(lambda _: self._goals.open.discard(self))
+        self._answer.add_done_callback(self._note_answer)
 
     def _sent(self, goal: ReachGoal.Goal, deadline: float, accept_s: float) -> ClientGoalHandle:
         """
@@ -256,29 +269,36 @@ class Reaching:
                 raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s; ' + (
                     f'{count} nodes serve it, leave one' if count > 1 else
                     server.silence or f'{server.name} may be busy or stopped'))
+            del self._goals.sent[bytes(self._id.uuid)]
             self._id, self._sent_anew = self._goals.new_id(), True
 
     def _send(self, goal: ReachGoal.Goal) -> Future:
-        goal_id = self._id
-
-        def take(message: Any) -> None:
-            try:
-                if goal_id == self._id:
-                    self._take(message.feedback)
-            except Exception as error:  # it would end the thread that spins the node
-                log_error(self._goals.node, f'{self._name}: on_feedback', error)
-                self.cancel()
-
         with self._lock:
             if self.given_up:
                 raise CallError(f'{self._name}: given up')
-            self._accepted = self._goals.action.send_goal_async(goal, take, goal_id)
+            self._goals.sent[bytes(self._id.uuid)] = self
+            self._accepted = self._goals.action.send_goal_async(goal, None, self._id)
             return self._accepted
 
-    def _is_over(self) -> bool:
-        """Return whether result would return or raise at once."""
+    def take(self, feedback: Any) -> None:
+        """Keep a feedback, or give it to on_feedback."""
+        try:
+            self._take(feedback)
+        except Exception as error:  # it would end the thread that spins the node
+            log_error(self._goals.node, f'{self._name}: on_feedback', error)
+            self.cancel()
+
+    def _note_answer(self, _: Future) -> None:
+        self._answered = time.monotonic()
+        self._goals.open.discard(self)
+
+    def _is_over(self, step: int) -> bool:
+        """Return whether no feedback is to come after that of a step."""
         assert self._answer is not None
-        return (self._answer.done() or time.monotonic() > self._deadline or self.planner_gone)
+        if self._answered:
+            return (step >= self._answer.result().result.steps
+                    or time.monotonic() > self._answered + LATE_S)
+        return time.monotonic() > self._deadline or self.planner_gone
 
     def _in_executor(self, function: Callable[[], Future], deadline: float) -> Future:
         """

@@ -273,6 +273,27 @@ def test_a_goal_that_the_planner_could_not_answer_is_sent_anew(lost):
         server.destroy()
 
 
+def test_feedback_that_comes_after_the_result_is_not_lost():
+    space, handles = '/late', []
+
+    def execute(handle):
+        handles.append(handle)
+        handle.publish_feedback(ReachGoal.Feedback(step=1))
+        handle.succeed()
+        return ReachGoal.Result(success=True, steps=2)
+
+    with Client('planner', namespace=space) as planner, tap_ros.Client(space) as client:
+        server = ActionServer(planner, ReachGoal, 'reach_goal', execute)
+        reaching, steps = client.reach(mode='direct'), []
+        reaching.result()
+        for feedback in reaching:
+            steps.append(feedback.step)
+            if feedback.step == 1:
+                handles[0].publish_feedback(ReachGoal.Feedback(step=2))
+        assert steps == [1, 2]
+        server.destroy()
+
+
 @pytest.mark.parametrize('end, why', [
     ('os.kill(os.getpid(), signal.SIGKILL)', 'has left the ROS graph'),
     ('os.kill(os.getpid(), signal.SIGINT)', 'cancelled'), ('sys.exit(0)', 'cancelled')])
