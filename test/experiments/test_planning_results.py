@@ -20,7 +20,7 @@ from experiments.planning.runs import (
     SPEED_ONLY,
 )
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.errors import ConfigError
 from tap_ros.planning.mpc_config import VisualMPCConfig, with_preset
 from tap_ros.planning.protocols import SearchConfig
