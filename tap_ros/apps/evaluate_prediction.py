@@ -20,7 +20,7 @@ from tap_ros.evaluation.samples import SAMPLES, SampleScores, score_samples
 from tap_ros.evaluation.strips import draw_strips
 from tap_ros.images.crop import trained_crop, TrainedCrop
 from tap_ros.images.drawing import png_bytes
-from tap_ros.images.robot_mask import trained_robot_mask
+from tap_ros.images.robot_mask import RobotMask, trained_robot_mask
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
@@ -138,7 +138,7 @@ def _open(args: Options, training: dict[str, Any], crop: TrainedCrop) -> Episode
 
 
 def _split(store: EpisodeStore, training: dict[str, Any], everything: bool,
-           robot_mask: str) -> tuple[np.ndarray, np.ndarray]:
+           robot_mask: RobotMask) -> tuple[np.ndarray, np.ndarray]:
     """Return which episodes were learned from, and which are scored: the others, or all."""
     learned, episodes = with_masks(store, split_as_trained(
         store, {} if everything else training,
