@@ -4,35 +4,109 @@
 
 import sys
 
-from tap_ros.apps.cli import CommandLine, EXTRAS, main
+from tap_ros.apps.cli import Command, CommandLine, EXTRAS, main
+
+
+def _paper():
+    from experiments.paper.command import Options, run
+    return Command(Options, run)
+
+
+def _planning():
+    from experiments.planning.command import Options, run
+    return Command(Options, run)
+
+
+def _worlds():
+    from experiments.worlds.command import Options, run
+    return Command(Options, run)
+
+
+def _worlds_loop():
+    from experiments.worlds.loop import Options, run
+    return Command(Options, run)
+
+
+def _labels():
+    from experiments.labels import Options, run
+    return Command(Options, run)
+
+
+def _real():
+    from experiments.real import Options, run
+    return Command(Options, run)
+
+
+def _few():
+    from experiments.few import Options, run
+    return Command(Options, run)
+
+
+def _fullsize():
+    from experiments.fullsize import Options, run
+    return Command(Options, run)
+
+
+def _tracking():
+    from experiments.tracking import Options, run
+    return Command(Options, run)
+
+
+def _weights():
+    from experiments.weights.command import Options, run
+    return Command(Options, run)
+
+
+def _bench_collect():
+    from experiments.bench.collect import Options, run
+    return Command(Options, run)
+
+
+def _bench_recording():
+    from experiments.bench.recording import Options, run
+    return Command(Options, run)
+
+
+def _bench_training():
+    from experiments.bench.training import Options, run
+    return Command(Options, run)
+
+
+def _bench_planning():
+    from experiments.bench.planning import Options, run
+    return Command(Options, run)
+
+
+def _bench_service():
+    from experiments.bench.nodes.service import Options, run
+    return Command(Options, run)
+
+
+def _bench_all():
+    from experiments.bench.everything import Options, run
+    return Command(Options, run)
+
 
 LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weights again.', {
-    'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
-    'planning': ('push or stack objects and score where they end (Table 2)',
-                 'experiments.planning.command'),
+    'paper': ("make the paper's prediction results again", _paper),
+    'planning': ('push or stack objects and score where they end (Table 2)', _planning),
     'worlds': ("collect other simulators' demonstrations and score who finds their bottlenecks",
-               'experiments.worlds.command'),
-    'worlds-loop': ("push in another simulator's scenes, by models trained there",
-                    'experiments.worlds.loop'),
-    'labels': ('score labels that a few marks give all demonstrations', 'experiments.labels'),
-    'real': ('score predictors that a few marks of real demonstrations make',
-             'experiments.real'),
-    'few': ('score what predictors learn from few demonstrations, simulated and real',
-            'experiments.few'),
-    'fullsize': ("score how sharp subgoals are at the camera's resolution",
-                 'experiments.fullsize'),
-    'tracking': ('score the tracker on simulated scenes and real films', 'experiments.tracking'),
-    'weights': ('make the shipped predictors again', 'experiments.weights.command'),
+               _worlds),
+    'worlds-loop': ("push in another simulator's scenes, by models trained there", _worlds_loop),
+    'labels': ('score labels that a few marks give all demonstrations', _labels),
+    'real': ('score predictors that a few marks of real demonstrations make', _real),
+    'few': ('score what predictors learn from few demonstrations, simulated and real', _few),
+    'fullsize': ("score how sharp subgoals are at the camera's resolution", _fullsize),
+    'tracking': ('score the tracker on simulated scenes and real films', _tracking),
+    'weights': ('make the shipped predictors again', _weights),
     'bench': ('measure speed', {
-        'collect': ('speed of collecting', 'experiments.bench.collect'),
-        'recording': ('speed of reading recordings', 'experiments.bench.recording'),
-        'training': ('speed of training the predictor', 'experiments.bench.training'),
-        'planning': ('time of a plan', 'experiments.bench.planning'),
-        'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
-        'all': ('one after the other, into a file', 'experiments.bench.everything'),
-    }),
-})
+        'collect': ('speed of collecting', _bench_collect),
+        'recording': ('speed of reading recordings', _bench_recording),
+        'training': ('speed of training the predictor', _bench_training),
+        'planning': ('time of a plan', _bench_planning),
+        'service': ('time of an answer of the predictor node', _bench_service),
+        'all': ('one after the other, into a file', _bench_all)})})
 
 if __name__ == '__main__':
     EXTRAS['pandas'] = 'pandas'
-    sys.exit(main(line=LINE))
+    sys.exit(main(LINE))

@@ -16,11 +16,11 @@ from tap_ros.base.text import listing
 from tap_ros.evaluation.hits import score_hits, seconds_off
 from tap_ros.evaluation.intervals import against_copying, Interval, mean_interval, share_interval
 from tap_ros.evaluation.prediction import EpisodeScores, evaluate, verdict
-from tap_ros.evaluation.samples import SAMPLES, score_samples
+from tap_ros.evaluation.samples import SAMPLES, SampleScores, score_samples
 from tap_ros.evaluation.strips import draw_strips
-from tap_ros.images.crop import trained_crop
+from tap_ros.images.crop import trained_crop, TrainedCrop
 from tap_ros.images.drawing import png_bytes
-from tap_ros.images.robot_mask import trained_robot_mask
+from tap_ros.images.robot_mask import RobotMask, trained_robot_mask
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
@@ -75,65 +75,37 @@ def run(args: Options) -> None:
 
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
-    network: PredictorNetwork | Predictor
-    if predictor_files(args.weights):
-        network, training = load_network(args.weights)
-        size = (network.config.image_size,) * 2
-        trained = trained_crop(training, size)
-    else:
-        network, training = load_predictor(args.weights), {}
-        size, trained = network.image_size, network.camera_crop
-    bags = find_bags(args.recordings)
-    store = open_recordings(bags, reading=reading_like(
-        training, bags, args.image_topic, trained))
-    if store.image_size != size:
-        raise ConfigError(f'{args.weights}: made for {size[1]}x{size[0]} pixels (width x height), '
-                          'the recordings have {1}x{0}; use matching ones'.format(
-                              *store.image_size))
-    robot_mask, settings = trained_robot_mask(training)[0], training.get('settings', {})
-    kept, episodes = with_masks(store, split_as_trained(
-        store, {} if args.all else training, settings.get('test_fraction', TEST_FRACTION)),
-        robot_mask)
-    if args.all:
-        kept, episodes = kept[:0], np.sort(np.concatenate([kept, episodes]))
-    if not len(episodes):
-        raise ConfigError('recordings: no episode of them was held out from training; '
-                          'give more of them, or --all')
-    marks = read_marks(args.marks, store) if args.marks else None
-    if marks and marks.episodes.keys().isdisjoint(episodes.tolist()):
-        raise ConfigError(
-            'marks: none of the episodes that are scored is marked; mark some of them, in the '
-            f'order of the recordings from 0: {listing(episodes)}; or give --all')
+    network, training, crop = _load(args.weights)
+    store = _open(args, training, crop)
+    robot_mask = trained_robot_mask(training)[0]
+    learned, episodes = _split(store, training, args.all, robot_mask)
+    marks = _read_marks(args.marks, store, episodes)
     filled = None if robot_mask == 'none' else FilledStore(store, robot_mask)
+
     scores = evaluate(network, store, episodes, args.goal_picture, filled,
                       marks.episodes if marks else {})
-    sources = {store[i].object_source or 'unknown' for i in episodes if store[i].object_names}
-    _print_table(scores, args.goal_picture, sources)
+    _print_table(scores, args.goal_picture, {
+        store[i].object_source or 'unknown' for i in episodes if store[i].object_names})
     warn_if_few(episodes)
+
     seen = None
-    if len(kept) and training.get('data_hash') == store.data_hash:
-        seen = evaluate(network, store, kept[:max(len(episodes), _SEEN)], args.goal_picture,
+    if len(learned) and training.get('data_hash') == store.data_hash:
+        seen = evaluate(network, store, learned[:max(len(episodes), _SEEN)], args.goal_picture,
                         filled)['prediction']
     words = verdict(scores['prediction'], seen)
     if seen is None and not args.all:
         words.append('training episodes: they are not among these recordings, so nothing tells '
                      'whether they were memorised')
     print('\n'.join(words))
+
     about: dict[str, Any] = {method: value.summary() | {'intervals': {
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
     if marks:
         about['marks'] = _score_marks(store, episodes, marks, scores['prediction'])
     if isinstance(network, PredictorNetwork) and network.config.latent_size:
-        drawn = score_samples(network, store, episodes, args.goal_picture, args.samples, filled)
-        about['samples'] = {'count': args.samples}
-        for name, title in (('min_l1', f'min_l1, best of {args.samples}'),
-                            ('spread', 'sample spread'), ('spread_px', 'sample spread, px')):
-            values = getattr(drawn, name)
-            if np.isfinite(values).all():
-                interval = mean_interval(values)
-                about['samples'][name] = interval.value
-                print(f'{title:28s}{_text(interval):>20s}')
+        about['samples'] = _summarize(args.samples, score_samples(
+            network, store, episodes, args.goal_picture, args.samples, filled))
     if args.out:
         result = {'weights': str(args.weights), 'data_hash': store.data_hash,
                   'goal_picture': args.goal_picture, 'margin': 0, 'verdict': words,
@@ -143,6 +115,63 @@ def run(args: Options) -> None:
         write_atomically(Path(args.out, 'scores.json'), json.dumps(result, indent=2) + '\n')
         write_atomically(Path(args.out, 'pictures.png'), png_bytes(draw_strips(
             network, store, episodes[:_STRIPS], args.goal_picture, filled, marks)))
+
+
+def _load(weights: str) -> tuple[PredictorNetwork | Predictor, dict[str, Any], TrainedCrop]:
+    """Return a predictor, what is known of its training, and the cut of its pictures."""
+    if not predictor_files(weights):
+        predictor = load_predictor(weights)
+        return predictor, {}, predictor.camera_crop
+    network, training = load_network(weights)
+    return network, training, trained_crop(training, (network.config.image_size,) * 2)
+
+
+def _open(args: Options, training: dict[str, Any], crop: TrainedCrop) -> EpisodeStore:
+    """Return the recordings, read as those of the training were."""
+    bags = find_bags(args.recordings)
+    store = open_recordings(bags, reading=reading_like(training, bags, args.image_topic, crop))
+    if store.image_size != crop.size:
+        raise ConfigError('{0}: made for {2}x{1} pixels (width x height), the recordings have '
+                          '{4}x{3}; use matching ones'.format(
+                              args.weights, *crop.size, *store.image_size))
+    return store
+
+
+def _split(store: EpisodeStore, training: dict[str, Any], everything: bool,
+           robot_mask: RobotMask) -> tuple[np.ndarray, np.ndarray]:
+    """Return which episodes were learned from, and which are scored: the others, or all."""
+    learned, episodes = with_masks(store, split_as_trained(
+        store, {} if everything else training,
+        training.get('settings', {}).get('test_fraction', TEST_FRACTION)), robot_mask)
+    if everything:
+        learned, episodes = learned[:0], np.sort(np.concatenate([learned, episodes]))
+    if not len(episodes):
+        raise ConfigError('recordings: no episode of them was held out from training; '
+                          'give more of them, or --all')
+    return learned, episodes
+
+
+def _read_marks(path: str, store: EpisodeStore, episodes: np.ndarray) -> Marks | None:
+    """Return the marks of a file, of some of these episodes at least; None without a file."""
+    marks = read_marks(path, store) if path else None
+    if marks and marks.episodes.keys().isdisjoint(episodes.tolist()):
+        raise ConfigError(
+            'marks: none of the episodes that are scored is marked; mark some of them, in the '
+            f'order of the recordings from 0: {listing(episodes)}; or give --all')
+    return marks
+
+
+def _summarize(count: int, drawn: SampleScores) -> dict[str, Any]:
+    """Print and return the means of what was drawn, where that is known."""
+    about: dict[str, Any] = {'count': count}
+    for name, title in (('min_l1', f'min_l1, best of {count}'), ('spread', 'sample spread'),
+                        ('spread_px', 'sample spread, px')):
+        values = getattr(drawn, name)
+        if np.isfinite(values).all():
+            interval = mean_interval(values)
+            about[name] = interval.value
+            print(f'{title:28s}{_text(interval):>20s}')
+    return about
 
 
 def _score_marks(store: EpisodeStore, episodes: np.ndarray, marks: Marks,

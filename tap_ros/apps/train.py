@@ -20,7 +20,6 @@ from tap_ros.weights import find_predictor
 Model = Literal['predictor', 'forward']
 Config = TrainingConfig | ForwardTrainingConfig
 
-Predictor, Forward = TrainingConfig, ForwardTrainingConfig  # options of the commands
 RECIPES: dict[str, dict[str, Any]] = {
     'predictor': training_config.RECIPES, 'forward': forward_training_config.RECIPES}
 
@@ -116,9 +115,6 @@ def _train(config: Config) -> str:
     return train_forward(config)
 
 
-def predictor(config: Config) -> None:
+def run(config: Config) -> None:
     """Train with the options of a command, and print where the weights are."""
     print(_train(config))
-
-
-forward = predictor

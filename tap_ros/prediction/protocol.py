@@ -9,14 +9,13 @@ tap_ros.predictors: a class with `load(argument, device)`.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast, Protocol
 
 import numpy as np
 from tap_ros.base.errors import ConfigError, ImageError, WeightsError
 from tap_ros.base.plugins import load_plugin, names
-from tap_ros.base.text import escaped
+from tap_ros.base.text import escaped, meant
 from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image, check_pixels
 from tap_ros.messages.subgoals import Subgoal
@@ -116,11 +115,10 @@ def load_predictor(text: str | Path, device: Any = 'cpu') -> Predictor:
     if name in names(GROUP):
         return cast(Predictor, load_plugin(GROUP, name).load(argument, device))
     if not find_predictor(text).exists() and Path(text).name == str(text) == Path(text).stem:
-        near = get_close_matches(name, [*PREDICTORS, *names(GROUP)], 1)
         raise WeightsError(
-            f'{escaped(text)}: no such weights file' + f'; did you mean {near[0]!r}?' * len(near)
-            + f' Valid: {", ".join(PREDICTORS)}, a .safetensors file, or NAME:ARGUMENT with '
-            f'NAME one of {", ".join(names(GROUP))}')
+            f'{escaped(text)}: no such weights file; '
+            f'{meant(name, [*PREDICTORS, *names(GROUP)])}valid: {", ".join(PREDICTORS)}, a '
+            f'.safetensors file, or NAME:ARGUMENT with NAME one of {", ".join(names(GROUP))}')
     return cast(Predictor, load_plugin(GROUP, 'tap').load(text, device))
 
 

@@ -32,13 +32,12 @@ from tap_ros.ros.heartbeat import Liveness
 from tap_ros.ros.reaching import CANCEL, CLIENT, Goals, Reaching
 from tap_ros.ros.requests import (
     by_name,
-    is_text,
     make_request,
-    names_of,
     pixels_of,
     request_fields,
     seconds_of,
     subgoals_of,
+    text_of,
 )
 from tap_ros.ros.run import configure_fast_dds
 from tap_ros.ros.topics import SERVICE_QOS, to_stamp
@@ -127,12 +126,7 @@ class Client:
 
     def silence(self, name: str) -> str:
         """Say for how long a node such as 'predictor_node' is silent; '' while it is not."""
-        silence: str = self._liveness(name).silence
-        return silence
-
-    def find(self, service: str) -> None:
-        """Look for one of SERVICES, and hear its node's heartbeat, from now on."""
-        self._service(service)
+        return self._liveness(name).silence
 
     def wait_until_ready(self, *names: str, timeout_s: float = 90.0) -> None:
         """
@@ -234,8 +228,7 @@ class Client:
 
         :raises CallError: when it cannot load them; then it has none.
         """
-        if not is_text(weights):
-            raise ConfigError(f'weights: expected a text, got {escaped(repr(weights), 60)}')
+        text_of(weights, 'weights')
 
         def change(*transitions: int) -> None:
             for transition in transitions:
@@ -276,7 +269,7 @@ class Client:
         :raises CallError: with the reason, such as a click on the robot; then nothing changes.
         """
         u, v = pixels_of(list(by_name(pixels).values()), 'pixels').T.tolist()
-        self.call('select', names=names_of(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
+        self.call('select', names=list(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""
@@ -327,11 +320,10 @@ class Client:
     @property
     def goals(self) -> Goals:
         """What sends goals."""
-        made: Goals = self._once('goals', lambda: Goals(
+        return self._once('goals', lambda: Goals(
             self.node, self._liveness(PLANNER), self._group, self.answers))
-        return made
 
-    def _liveness(self, name: str) -> Any:
+    def _liveness(self, name: str) -> Liveness:
         return self._once(name, lambda: Liveness(self.node, name, self._group))
 
     def _timeout(self, timeout_s: float | None) -> float:

@@ -172,8 +172,7 @@ class LifecycleBase(LifecycleNode):
     @property
     def _state(self) -> str:
         """Return the label of the present state."""
-        label: str = self._get_state(None, GetState.Response()).current_state.label
-        return label
+        return self._get_state(None, GetState.Response()).current_state.label
 
     def _check_weights(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse other weights unless the node is unconfigured."""

@@ -26,6 +26,8 @@ from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
 
 FARTHEST = 100.0  # m; no camera is there
 OF_RCLPY = {'use_sim_time', 'start_type_description_service'}  # parameters of any node
+
+
 def setting(default: Any, **limits: Any) -> Any:
     """
     Return a field of a dataclass of parameters, whose `:param` lines describe them.

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests of a Client made from arrays and names, checked before anything is sent."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 import math
 from typing import Any
 
@@ -32,8 +33,9 @@ def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any
         if name.endswith('objects') and values is not None:
             pixels = pixels_of(values, name)
             fields[name] = encode_objects(
-                names_of(names or [f'object {k + 1}' for k in range(len(pixels))]), pixels, None,
-                to_stamp(0), CAMERA_FRAME, ObjectStates.SOURCE_TRACKED)
+                [text_of(each, 'the name of an object') for each in (
+                    names or [f'object {k + 1}' for k in range(len(pixels))])],
+                pixels, None, to_stamp(0), CAMERA_FRAME, ObjectStates.SOURCE_TRACKED)
         elif values is not None:
             picture = np.asarray(values)
             if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
@@ -54,21 +56,12 @@ def make_request(kind: Callable[..., Any], fields: Mapping[str, Any]) -> Any:
     """Return a message; raise ConfigError for what one of its fields cannot hold."""
     for name, value in fields.items():
         for text in value if isinstance(value, (list, tuple, set)) else [value]:
-            if isinstance(text, str) and not is_text(text):
-                raise ConfigError(f'{name}: expected a text, got {escaped(repr(text), 60)}')
+            if isinstance(text, str):
+                text_of(text, name)
     try:
         return kind(check_fields=True, **fields)
     except AssertionError as error:
         raise ConfigError(escaped(error)) from error
-
-
-def names_of(names: Iterable[Any]) -> list[str]:
-    """Return names of objects; raise ConfigError for what a message cannot hold."""
-    for name in (names := list(names)):
-        if not is_text(name):
-            raise ConfigError(
-                f'the name of an object: expected a text, got {escaped(repr(name), 60)}')
-    return names
 
 
 def by_name(pixels: Any) -> Mapping[str, Any]:
@@ -79,12 +72,13 @@ def by_name(pixels: Any) -> Mapping[str, Any]:
     return pixels
 
 
-def is_text(value: Any) -> bool:
-    """Tell whether a value is a text that UTF-8 can hold."""
-    try:
-        return isinstance(value, str) and bool(value.encode() or True)
-    except UnicodeError:
-        return False
+def text_of(value: Any, what: str) -> str:
+    """Return a text; raise ConfigError for what is none that UTF-8 can hold."""
+    with suppress(UnicodeError):
+        if isinstance(value, str):
+            value.encode()
+            return value
+    raise ConfigError(f'{what}: expected a text, got {escaped(repr(value), 60)}')
 
 
 def pixels_of(values: Any, what: str) -> np.ndarray:

@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Training batches from recorded episodes, and changes of their appearance.
+Training batches from recorded episodes.
 
 A batch depends on nothing but the episodes, the seed and the step: training that is interrupted
 and resumed sees the same ones.
@@ -10,9 +10,10 @@ and resumed sees the same ones.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Self, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
+from tap_ros.training.augmentation import Augmentation
 from tap_ros.training.frames import FilledStore, Frames, gather, GOAL
 import torch
 
@@ -59,7 +60,7 @@ class Batch:
     bare: torch.Tensor | None = None
     seen: torch.Tensor | None = None
     preference: torch.Tensor | None = None
-    augmentation: 'Augmentation | None' = None
+    augmentation: Augmentation | None = None
 
     @property
     def measured(self) -> torch.Tensor:
@@ -274,56 +275,3 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
     video[video == start + end] = goal
     filled = sampling.fill_context > 0 and rng.random() < sampling.fill_context
     return _Row(start, context, video, times, (first, last, end), filled)
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """
-    A change of appearance, the same for all pictures of an episode, that can be undone.
-
-    :param flip: bool (B,), mirror left and right.
-    :param order: int64 (B, 3), which channel each colour channel is taken from.
-    :param gain: (B, 3), factor on each channel's brightness.
-    """
-
-    flip: torch.Tensor
-    order: torch.Tensor
-    gain: torch.Tensor
-
-    @classmethod
-    def draw(cls, batch_size: int, colour: bool, brightness: float,
-             rng: np.random.Generator) -> Self:
-        """
-        Draw one for each episode of a batch; half of them are mirrored.
-
-        :param colour: whether to permute their colour channels.
-        :param brightness: gains lie within 1 +- this.
-        """
-        order = np.argsort(rng.random((batch_size, 3)), 1)
-        if not colour:
-            order = np.tile(np.arange(3), (batch_size, 1))
-        flips = rng.random(batch_size) < 0.5
-        gain = 1 + brightness * rng.uniform(-1, 1, (batch_size, 3))
-        return cls(*map(torch.from_numpy, (flips, order, gain.astype(np.float32))))
-
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> 'Augmentation':
-        """Copy everything to a device."""
-        return Augmentation(**{name: value.to(device, non_blocking=non_blocking)
-                               for name, value in vars(self).items()})
-
-    def apply(self, images: torch.Tensor) -> torch.Tensor:
-        """Change pictures (B, N, 3, H, W) in [-1, 1]; a gain may brighten them beyond 1."""
-        images = _take_channels(images, self.order)
-        images = (images + 1) * self.gain[:, None, :, None, None] - 1
-        return torch.where(self.flip[:, None, None, None, None], images.flip(-1), images)
-
-    def undo(self, images: torch.Tensor) -> torch.Tensor:
-        """Change pictures (B, N, 3, H, W), as apply returned them, back."""
-        images = torch.where(self.flip[:, None, None, None, None], images.flip(-1), images)
-        images = (images + 1) / self.gain[:, None, :, None, None] - 1
-        return _take_channels(images, self.order.argsort(1))
-
-
-def _take_channels(images: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
-    order = order[:, None, :, None, None].expand_as(images)
-    return images.gather(2, order)

@@ -22,13 +22,7 @@ from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.recording.reading import Reading
 from tap_ros.training.forward_config import ForwardTrainingConfig
-from tap_ros.training.forward_loss import (
-    Cuts,
-    draw_arm_like,
-    forward_loss,
-    make_windows,
-    Windows,
-)
+from tap_ros.training.forward_loss import Cuts, forward_loss, make_windows, Windows
 from tap_ros.training.forward_scores import held_out_scores
 from tap_ros.training.frames import Episodes, FilledStore
 from tap_ros.training.run import Run
@@ -39,6 +33,7 @@ AVERAGE_DECAY = 0.995  # of the moving average that is shipped
 HORIZON = 8  # control periods of the longest windows
 PICTURES = 4  # compared per window
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
+_SHOWN = 6  # windows in a sample picture
 MOST_MISSED = 3 / 64  # of the picture's side, by which the arm may be beside its fit
 
 
@@ -144,27 +139,23 @@ def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarr
 
 
 @torch.no_grad()
-def sample_grid(model: LearnedForwardModel, store: Episodes, episodes: np.ndarray,
-                rows: int = 6, seed: int = 0) -> np.ndarray:
+def sample_grid(model: LearnedForwardModel, store: Episodes,
+                episodes: np.ndarray) -> np.ndarray:
     """
     Show windows: first picture, its objects' mask and background, then true beside predicted.
 
     :return: uint8 (height, width, 3).
     """
-    cuts = Cuts.draw(store, episodes, rows, HORIZON, np.random.default_rng(seed))
+    cuts = Cuts.draw(store, episodes, _SHOWN, HORIZON, np.random.default_rng(0))
     batch = make_windows(store, Cuts(cuts.episodes, cuts.starts, HORIZON),
                          model.homography.cpu()).to(model.homography.device)
-
-    def arm(t: int) -> torch.Tensor:
-        return draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
-
-    scene = model.look(batch.images[:, 0], arm(0)[:, 3:], batch.homography)
+    scene = model.look(batch.images[:, 0], model.draw_arm(batch.grippers[:, 0])[:, 3:])
     columns = [list(to_uint8(batch.images[:, 0])), grey_panels(scene.objects[:, 3].cpu()),
                list(to_uint8(scene.background))]
-    flow, gripper = model.still(rows), batch.grippers[:, 0]
+    flow, gripper = model.still(_SHOWN), batch.grippers[:, 0]
     for t in range(1, HORIZON + 1):
         flow, gripper, _ = model.advance(scene.features, flow, gripper, batch.actions[:, t - 1])
         if t in (HORIZON // 3, 2 * HORIZON // 3, HORIZON):
-            predicted, _ = model.picture(scene, flow, arm(t), batch.homography)
+            predicted, _ = model.picture(scene, flow, model.draw_arm(batch.grippers[:, t]))
             columns += [list(to_uint8(batch.images[:, t])), list(to_uint8(predicted))]
     return grid([list(row) for row in zip(*columns)])

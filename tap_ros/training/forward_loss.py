@@ -17,6 +17,7 @@ from tap_ros.images.pixels import to_float
 from tap_ros.images.robot_mask import hidden_pixels, RobotMask
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.table import mirror_table
+from tap_ros.training.augmentation import mirror, recolour
 import torch
 from torch.nn import functional as F
 
@@ -113,29 +114,12 @@ def make_windows(store: 'Episodes', cuts: Cuts, homography: torch.Tensor,
     return batch
 
 
-def recolour(images: torch.Tensor, colours: torch.Tensor) -> torch.Tensor:
-    """Reorder the first three channels of images (B, ..., C, H, W) by colours (B, ..., 3)."""
-    index = colours[..., None, None].expand(*images.shape[:-3], 3, *images.shape[-2:])
-    return torch.cat([images[..., :3, :, :].gather(-3, index), images[..., 3:, :, :]], -3)
-
-
-def mirror(images: torch.Tensor, mirrored: torch.Tensor) -> torch.Tensor:
-    """Flip those images (B, ..., H, W) left to right that are mirrored (B,)."""
-    shape = [-1] + [1] * (images.ndim - 1)
-    return torch.where(mirrored.view(shape), images.flip(-1), images)
-
-
-def draw_arm_like(model: LearnedForwardModel, grippers: torch.Tensor, mirrored: torch.Tensor,
-                  colours: torch.Tensor) -> torch.Tensor:
-    """
-    Draw the arm as it looks in augmented pictures.
-
-    :param grippers: (B, 4) as augmented; mirrored (B,) bool; colours (B, 3) channel orders.
-    :return: (B, 4, H, W), see LearnedForwardModel.draw_arm.
-    """
-    sign = 1 - 2 * mirrored.float()
-    plain = torch.cat([grippers[:, :1] * sign[:, None], grippers[:, 1:]], 1)
-    return mirror(recolour(model.draw_arm(plain), colours), mirrored)
+def draw_arm_like(model: LearnedForwardModel, batch: Windows, t: int) -> torch.Tensor:
+    """Draw the arm as it looks in pictures t: (B, 4, H, W), see LearnedForwardModel.draw_arm."""
+    gripper, sign = batch.grippers[:, t], 1 - 2 * batch.mirrored.float()
+    arm = model.draw_arm(torch.cat([gripper[:, :1] * sign[:, None], gripper[:, 1:]], 1))
+    coloured = torch.cat([recolour(arm[:, :3], batch.colours), arm[:, 3:]], 1)
+    return mirror(coloured, batch.mirrored)
 
 
 def motion_weight(target: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
@@ -179,7 +163,7 @@ def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Coll
     :param picture_steps: indices in 1..T of the pictures compared.
     :return: loss, dict of its parts.
     """
-    arms = draw_arm_like(model, batch.grippers[:, 0], batch.mirrored, batch.colours)
+    arms = draw_arm_like(model, batch, 0)
     first = batch.images[:, 0]
     scene = model.look(first, arms[:, 3:].detach(), batch.homography)
     flow, gripper = model.still(len(first)), batch.grippers[:, 0]
@@ -190,7 +174,7 @@ def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Coll
         flow, gripper, masks = model.advance(scene.features, flow, gripper, action)
         moving = moving + (1 - masks[:, 2]).mean()
         if t in picture_steps:
-            arm = draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
+            arm = draw_arm_like(model, batch, t)
             predicted, _ = model.picture(scene, flow, arm, batch.homography)
             target = batch.images[:, t]
             predicted = torch.where(batch.hidden[:, t], target, predicted)

@@ -16,14 +16,8 @@ from tap_ros.prediction.losses import l1_error
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import EpisodeStore
-from tap_ros.training.batches import (
-    Augmentation,
-    Batch,
-    episode_order,
-    make_batch,
-    Pictures,
-    Sampling,
-)
+from tap_ros.training.augmentation import Augmentation
+from tap_ros.training.batches import Batch, episode_order, make_batch, Pictures, Sampling
 from tap_ros.training.frames import FilledStore, ResidentFrames
 from tap_ros.training.keyframes import Keyframes
 from tap_ros.training.marks import episode_preferences

@@ -96,8 +96,13 @@ class Run(Generic[Config]):
         self.store = open_recordings(
             bags_of(config), progress=self.progress, reading=reading_of(config),
             network=f'the {self.kind.replace("_", " ")}')
-        path = getattr(config, 'marks', '')
-        marked = read_marks(path, self.store).episodes if path else {}
+        # What tells from which data a checkpoint is: recordings, and marks if there are.
+        self._data_hash = self.store.data_hash
+        marked: Mapping[int, Any] = {}
+        if marks := getattr(config, 'marks', ''):
+            marked = read_marks(marks, self.store).episodes
+            self._data_hash = hashlib.sha256(
+                self._data_hash.encode() + Path(marks).read_bytes()).hexdigest()
         self.training, self.held_out = with_masks(self.store, split_episodes(
             self.store, config.test_fraction, self._min_frames, config.held_out, marked,
             config.split), config.robot_mask)
@@ -129,11 +134,6 @@ class Run(Generic[Config]):
         :param network: with fresh weights; average_decay, helpers: see checkpoints.start.
         """
         state = start(network, self.config.learning_rate, self.device, average_decay, helpers)
-        # What tells from which data a checkpoint is: recordings, and marks if there are.
-        self._data_hash, marks = self.store.data_hash, getattr(self.config, 'marks', '')
-        if marks and Path(marks).is_file():  # who reads them says so
-            self._data_hash = hashlib.sha256(
-                self._data_hash.encode() + Path(marks).read_bytes()).hexdigest()
         load_checkpoint(self.checkpoint, state, asdict(self.config), self._data_hash)
         self.state: TrainingState[Any] = state
         return state

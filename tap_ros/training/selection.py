@@ -7,6 +7,7 @@ import math
 
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction import losses
+from tap_ros.training.augmentation import mirror
 from tap_ros.training.batches import Batch
 from tap_ros.training.predictor_config import TrainingConfig
 import torch
@@ -72,11 +73,11 @@ class Targets:
 
     def visible(self, image: torch.Tensor) -> torch.Tensor:
         """Return augmented pictures (B, 3, H, W), black where targets are, see Batch.visible."""
-        if self.batch.seen is None:
-            return image
         seen = self.batch.seen
+        if seen is None:
+            return image
         if self.augmentation:
-            seen = torch.where(self.augmentation.flip[:, None, None], seen.flip(-1), seen)
+            seen = mirror(seen, self.augmentation.flip)
         return image.masked_fill(~seen[:, None], -1)
 
     def match(self, image: torch.Tensor, context: torch.Tensor,

@@ -131,11 +131,7 @@ def _usable(store: 'EpisodeStore', min_frames: int = 3) -> list[int]:
     """Return the episodes that are long enough; a RecordingError says that there are none."""
     usable = [i for i in range(len(store)) if store.lengths[i] >= min_frames]
     if not usable:
-        begins = np.array([store[i].stamps[0] for i in range(len(store))])
-        pauses = np.diff(begins)[np.diff(begins) > 0] / 1e9
-        together = '' if store.marked or not len(pauses) else (
-            f', or, as there is a picture each {np.median(pauses):.2g} s, keep them together: '
-            f'--gap {2 * np.median(pauses):.2g}')
+        together = '' if store.marked else ', or give a larger --gap'
         raise RecordingError(f'recordings: no episode has at least {min_frames} frames; '
                              f'record longer ones{together}')
     return usable

@@ -8,7 +8,6 @@ Both are the predictor's encoder with other ends (appendix C).
 
 import math
 
-from tap_ros.base.errors import ConfigError
 from tap_ros.prediction.networks import encoder, initialise, PredictorConfig
 import torch
 from torch import nn
@@ -98,15 +97,11 @@ class Recognition(nn.Module):
     :param config: PredictorConfig of the predictor that takes z.
     :param num_images: how many pictures it takes.
     :param initial_std: standard deviation of z that it begins with.
-    :raises ConfigError: if that predictor has no z.
     """
 
     def __init__(self, config: PredictorConfig, num_images: int,
                  initial_std: float = 1.0) -> None:
         super().__init__()
-        if config.latent_size < 1:
-            raise ConfigError('latent_size: a recognition network needs at least 1, got '
-                              f'{config.latent_size}; the paper has 32')
         self.encoder = encoder(3 * num_images, config.widths)
         self.head = _head(config, 2 * config.latent_size)
         self.apply(initialise)

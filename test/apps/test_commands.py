@@ -13,7 +13,8 @@ import sys
 
 from experiments.__main__ import LINE
 import pytest
-from tap_ros.apps.cli import _load, main, read, TAP_ROS
+from tap_ros.__main__ import LINE as TAP_ROS
+from tap_ros.apps.cli import main, read
 from tap_ros.base.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -34,16 +35,16 @@ def kinds():
     """Return the options of each command by its words, such as 'tap_ros train forward'."""
     flat = {}
     for place, line in LINES.items():
-        for name, (_, module) in line.commands.items():
-            flat |= {f'{place} {name} {word}': inner for word, (_, inner) in module.items()
-                     } if isinstance(module, dict) else {f'{place} {name}': module}
-    return {words: _load(module, {}) for words, module in flat.items()}
+        for name, (_, load) in line.commands.items():
+            flat |= {f'{place} {name} {word}': inner for word, (_, inner) in load.items()
+                     } if isinstance(load, dict) else {f'{place} {name}': load}
+    return {words: load().options for words, load in flat.items()}
 
 
 def given_in(line):
     """Return the options that a command line gives."""
     place, *words = shlex.split(line)
-    return read(words, LINES[place])[1]
+    return read(LINES[place], words)[1]
 
 
 def options(kind):
@@ -63,7 +64,7 @@ def help_of(command, capsys, monkeypatch):
     monkeypatch.setenv('COLUMNS', '80')
     with pytest.raises(SystemExit) as end:
         place, *words = command.split()
-        main([*words, '--help'], LINES[place])
+        main(LINES[place], [*words, '--help'])
     assert end.value.code == 0
     return ' '.join(re.sub(r'[^\x20-\x7e]', ' ', capsys.readouterr().out).split())
 
@@ -72,7 +73,7 @@ def refused(line, capsys):
     """Return what is said of words that are wrong."""
     with pytest.raises(SystemExit) as end:
         place, *words = shlex.split(line)
-        main(words, LINES[place])
+        main(LINES[place], words)
     assert end.value.code == 2
     return ' '.join(re.sub(r'[^\x20-\x7e]', ' ', capsys.readouterr().err).split())
 
@@ -129,8 +130,9 @@ def test_help_comes_without_what_takes_long_to_import():
         line, *words = command.split()
         slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard'} - {*allowed}
         run = subprocess.run([sys.executable, '-c', (
-            'import atexit, sys; from tap_ros.apps.cli import main, TAP_ROS; '
+            'import atexit, sys; from tap_ros.apps.cli import main; '
+            'from tap_ros.__main__ import LINE as TAP_ROS; '
             'from experiments.__main__ import LINE; '
             f'atexit.register(lambda: print("slow:", {slow} & set(sys.modules))); '
-            f'main(sys.argv[1:] + ["--help"], {line})'), *words], capture_output=True, text=True)
+            f'main({line}, sys.argv[1:] + ["--help"])'), *words], capture_output=True, text=True)
         assert run.returncode == 0 and run.stdout.splitlines()[-1] == 'slow: set()', command

@@ -16,7 +16,7 @@ import cv2
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.apps.label_command import Options
 from tap_ros.apps.mark_command import MarkServer, parse_names, words_of
 from tap_ros.apps.marking import Marking

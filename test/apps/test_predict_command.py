@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights.weights import save_weights

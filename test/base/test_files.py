@@ -9,7 +9,7 @@ import sys
 from threading import Thread
 
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.errors import StorageError
 from tap_ros.base.files import only_writer, write_atomically
 

@@ -128,7 +128,7 @@ def test_the_command_leaves_numbers_and_films_and_runs_nothing_again(
     words = ['planning', '--tasks', 'push2', 'stack2', '--methods', 'nothing',
              'direct:steps2', 'shipped:tracked:steps2', '--scenes', '1',
              '--out', str(out), '--preset', 'quick', '--solver', 'icem']
-    assert main(words, LINE) == 0
+    assert main(LINE, words) == 0
     rows = json.loads((out / 'planning.json').read_text())
     assert {row['method'] for row in rows} == {
         'nothing', 'direct:steps2', 'shipped:tracked:steps2'}
@@ -141,7 +141,7 @@ def test_the_command_leaves_numbers_and_films_and_runs_nothing_again(
     for film in ('planning/push2-direct--steps2.png', 'stacking/stack2-direct--steps2.png'):
         assert (out / film).read_bytes().startswith(b'\x89PNG')
     files = {path: path.stat().st_mtime_ns for path in out.rglob('*-*.json')}
-    assert main([*words, '--no-films'], LINE) == 0 and main([*words, '--results-only'], LINE) == 0
+    assert main(LINE, [*words, '--no-films']) == 0 and main(LINE, [*words, '--results-only']) == 0
     assert files == {path: path.stat().st_mtime_ns for path in files}  # nothing is run again
-    assert main([*words, '--methods', 'unheard_of'], LINE) == 1
+    assert main(LINE, [*words, '--methods', 'unheard_of']) == 1
     assert '--predictor unheard_of=FILE' in capsys.readouterr().err

@@ -7,7 +7,7 @@ from pathlib import Path
 from experiments.weights import command
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.training.predictor_config import RECIPES, TrainingConfig
 from tap_ros.weights import PREDICTORS

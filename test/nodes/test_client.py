@@ -13,7 +13,7 @@ from processes import Client, until
 import pytest
 from std_msgs.msg import Bool
 import tap_ros
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.errors import ConfigError
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.predictor.node import OVERLAY_SIDE

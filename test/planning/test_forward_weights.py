@@ -10,7 +10,7 @@ from pathlib import Path
 from made_episodes import write_bag
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.forward_scores import held_out_scores

@@ -16,7 +16,8 @@ from made_bags import camera, joints, record, SECOND, write_mcap
 import numpy as np
 import pytest
 from rosbags.rosbag2 import Writer as Ros2Writer
-from tap_ros.apps.cli import main, read
+from tap_ros.__main__ import LINE, main
+from tap_ros.apps.cli import read
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import typestore
@@ -122,7 +123,7 @@ def test_for_what_is_no_bag_the_command_is_told(name, content, command, tmp_path
         assert main(['inspect', str(path)]) == 1
         said = capsys.readouterr().err
         advice = shlex.split(said[said.index('python -m tap_ros'):])
-        assert advice[3] == command and str(tmp_path) in advice[4] and read(advice[3:])
+        assert advice[3] == command and str(tmp_path) in advice[4] and read(LINE, advice[3:])
 
 
 def test_messages_that_are_not_read_are_named_instead_of_a_topic_to_choose(tmp_path):

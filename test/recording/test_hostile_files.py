@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow
 from pyarrow import parquet
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.recording import mcap_file
 from tap_ros.recording.cache import open_recordings

@@ -15,7 +15,7 @@ import cv2
 import google_crc32c
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.recording.cache import open_recordings
 
 

@@ -15,7 +15,7 @@ import pyarrow
 from pyarrow import parquet
 import pyarrow.compute
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats import lerobot_export
 from tap_ros.recording.formats.lerobot_format import ACTION, CAMERA, OBJECTS, STATE

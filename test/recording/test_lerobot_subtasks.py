@@ -8,7 +8,7 @@ from made_episodes import write_bag
 import numpy as np
 import pandas
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks

@@ -8,7 +8,7 @@ from made_bags import camera, joints, read, record
 from made_episodes import assert_all_equal, make_episode, write_bag
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.contract import MOST_SIGNALS
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.augmentation import Augmentation
 from tap_ros.training.batches import (
-    Augmentation,
     episode_order,
     make_batch,
     Pictures,

@@ -7,7 +7,7 @@ import json
 from made_bags import camera, joints, record
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.apps.label_command import describe_all
 from tap_ros.base.errors import ConfigError
 from tap_ros.recording.cache import open_recordings

@@ -11,7 +11,7 @@ from made_episodes import make_episode, write_bag
 from mcap.reader import make_reader
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.apps.label_command import distinct_names
 from tap_ros.base.errors import ConfigError
 from tap_ros.messages.stamps import to_nanoseconds

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training.batches import Augmentation, make_batch, Pictures, Sampling
+from tap_ros.training.augmentation import Augmentation
+from tap_ros.training.batches import make_batch, Pictures, Sampling
 from tap_ros.training.frames import FilledStore
 from tap_ros.training.objective import (
     discriminators_loss,

@@ -9,6 +9,7 @@ from pathlib import Path
 from experiments.paper.methods import method_fields
 import pytest
 import tap_ros
+from tap_ros.__main__ import LINE
 from tap_ros.apps.cli import read
 from tap_ros.base.errors import ConfigError
 from tap_ros.training.forward_config import RECIPES as FORWARD_RECIPES
@@ -69,14 +70,19 @@ def test_every_recipe_can_be_trained_and_a_typo_is_answered_with_the_nearest():
         tap_ros.train(SAMPLE, recipe='pusch2')
 
 
+def options_of(*words):
+    """Return the options of a training by words."""
+    return read(LINE, ['train', 'predictor', *words])[1]
+
+
 def test_without_options_the_sample_is_trained_by_its_tasks_recipe(tmp_path):
-    asked = read(['train', 'predictor', str(SAMPLE)])[1]
-    named = read(['train', 'predictor', str(SAMPLE), '--recipe', 'push2'])[1]
+    asked = options_of(str(SAMPLE))
+    named = options_of(str(SAMPLE), '--recipe', 'push2')
     assert asked == named == replace(RECIPES['push2'], recordings=(str(SAMPLE),), recipe='push2')
-    order = read(['train', 'predictor', str(SAMPLE), '--recipe', 'order2', '--steps', '3'])[1]
+    order = options_of(str(SAMPLE), '--recipe', 'order2', '--steps', '3')
     assert order.selection == 'relative' and order.steps == 3
 
-    marked = read(['train', 'predictor', str(tmp_path), '--marks', 'x'])[1]  # no task of ours
+    marked = options_of(str(tmp_path), '--marks', 'x')  # no task of ours
     assert (marked.selection, marked.margin, marked.new_pixels) == ('marks', 1, True)
 
     weights = tap_ros.train(SAMPLE, tmp_path / 'run', recipe='debug', steps=2)

@@ -10,7 +10,8 @@ import pytest
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.losses import bell_preference, l1_error
 from tap_ros.prediction.networks import Prediction
-from tap_ros.training.batches import Augmentation, Batch
+from tap_ros.training.augmentation import Augmentation
+from tap_ros.training.batches import Batch
 from tap_ros.training.objective import (
     discriminators_loss,
     Draws,

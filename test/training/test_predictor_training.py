@@ -9,7 +9,7 @@ from pathlib import Path
 from experiments.paper.methods import method_fields
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.errors import ConfigError
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.recording.cache import open_recordings

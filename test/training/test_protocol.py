@@ -9,7 +9,7 @@ from made_episodes import move_squares
 import numpy as np
 import pytest
 from tap_ros import Predictor
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base import plugins
 from tap_ros.base.errors import ConfigError, WeightsError
 from tap_ros.images.crop import trained_crop

@@ -10,7 +10,7 @@ import shutil
 import signal
 
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.errors import ConfigError, StorageError, WeightsError
 from tap_ros.base.files import only_writer
 from tap_ros.training.checkpoints import start, TrainingState, WARMUP

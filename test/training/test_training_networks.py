@@ -3,7 +3,6 @@
 """Laws of the discriminators and of the recognition network, and of their losses."""
 
 import pytest
-from tap_ros.base.errors import ConfigError
 from tap_ros.prediction.networks import PredictorConfig
 from tap_ros.training.training_networks import (
     Discriminator,
@@ -66,5 +65,3 @@ def test_recognition_begins_with_the_spread_asked_for():
     for std in (1.0, 0.1):
         mean, log_variance = Recognition(SMALL, 6, std)(video)
         assert (log_variance / 2).exp().allclose(torch.tensor(std), rtol=0.2)
-    with pytest.raises(ConfigError, match='latent_size'):  # a predictor without z has none
-        Recognition(PredictorConfig(base_width=4), 6)

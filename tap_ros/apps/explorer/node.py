@@ -3,6 +3,7 @@
 """A page for browsers: see camera, goal, subgoal and plan, and try them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 import json
 import time
 from typing import Any
@@ -22,7 +23,7 @@ from tap_ros.messages.images import is_empty
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
-from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.parameters import Parameters, setting
 from tap_ros.ros.subscriptions import adapt_regularly, AdaptiveSubscription, steady_timer
 from tap_ros.ros.topics import camera_image, LATCHED, STREAM
 
@@ -177,16 +178,28 @@ class ExplorerNode(Node):
         return 'goal' if pictured else 'camera'
 
 
+@dataclass(frozen=True)
+class ExplorerParameters:
+    """
+    Parameters that this node alone has.
+
+    :param host: Address at which browsers find the page. One that is not of this machine alone,
+        such as 0.0.0.0, needs a token.
+    :param port: Port of the page; 0: any that is free.
+    :param token: That browsers must give as ?token=...; empty: none is needed where host is of
+        this machine alone, else one is made up and printed.
+    :param task: Of the simulator's first scene; resets are heard.
+    """
+
+    host: str = '127.0.0.1'
+    port: int = setting(8000, between=(0, 65535))
+    token: str = ''
+    task: str = ''
+
+
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare(
-        'host', '127.0.0.1', 'Address at which browsers find the page. One that is not of this '
-        'machine alone, such as 0.0.0.0, needs a token.')
-    parameters.declare('port', 8000, 'Port of the page; 0: any that is free.', between=(0, 65535))
-    parameters.declare(
-        'token', '', 'That browsers must give as ?token=...; empty: none is needed where host is '
-        'of this machine alone, else one is made up and printed.')
-    parameters.declare('task', '', "Of the simulator's first scene; resets are heard.")
+    parameters.declare_fields(ExplorerParameters)
     parameters.declare_shared('image_transport')
     return parameters

@@ -85,7 +85,7 @@ class VisualMpcNode(LifecycleBase):
             self, self.params, lambda: self._model.camera_crop, self._diagnostics.received)
         self._sensors = self._inputs.sensors
         client = Client(node=self)
-        client.find('predict')  # by the time of the first goal
+        client.is_ready('predict')  # looked for now, found by the time of the first goal
         self._goal = GoalSource(self, self.params, self._inputs, client, self._diagnostics)
         self._arm = ArmCommander(self, self.params, self._sensors)
         self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM)
