@@ -13,6 +13,7 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import Bags, File, Flag, Folder, Topic
 from tap_ros.base.text import listing
+from tap_ros.evaluation.full_size import Answer, answer_at_full_size
 from tap_ros.evaluation.hits import score_hits, seconds_off
 from tap_ros.evaluation.intervals import against_copying, Interval, mean_interval, share_interval
 from tap_ros.evaluation.prediction import EpisodeScores, evaluate, verdict
@@ -22,7 +23,7 @@ from tap_ros.images.crop import trained_crop, TrainedCrop
 from tap_ros.images.drawing import png_bytes
 from tap_ros.images.robot_mask import RobotMask, trained_robot_mask
 from tap_ros.prediction.networks import PredictorNetwork
-from tap_ros.prediction.predictor import load_network
+from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
 from tap_ros.recording.bags import find_bags, reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
@@ -37,6 +38,7 @@ _SHOWN = ('min_l1', 'copying_l1', 'changed_l1', 'match_fraction', 'match_fractio
           'bottleneck_5px', 'shows_hand', 'shows_objects', 'shows_both')
 WITHIN_S = (0.3, 0.5, 1.0)  # of a mark
 _STRIPS = 12  # episodes that are drawn
+_LARGE = 100  # episodes, at most, that are scored at the camera's size
 _SEEN = 20  # of those trained on, so many are scored, or as many as are held out
 
 
@@ -98,9 +100,14 @@ def run(args: Options) -> None:
                      'whether they were memorised')
     print('\n'.join(words))
 
+    answers = [] if filled else _answer_large(
+        network, training, store, episodes, args.goal_picture, scores['prediction'])
     about: dict[str, Any] = {method: value.summary() | {'intervals': {
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
+    if answers:
+        about['full_size'] = {name: [getattr(one, name) for one in answers]
+                              for name in ('l1', 'copying')}
     if marks:
         about['marks'] = _score_marks(store, episodes, marks, scores['prediction'])
     if isinstance(network, PredictorNetwork) and network.config.latent_size:
@@ -114,7 +121,8 @@ def run(args: Options) -> None:
             result['robot_mask'] = robot_mask
         write_atomically(Path(args.out, 'scores.json'), json.dumps(result, indent=2) + '\n')
         write_atomically(Path(args.out, 'pictures.png'), png_bytes(draw_strips(
-            network, store, episodes[:_STRIPS], args.goal_picture, filled, marks)))
+            network, store, episodes[:_STRIPS], args.goal_picture, filled, marks,
+            [one.pictures for one in answers])))
 
 
 def _load(weights: str) -> tuple[PredictorNetwork | Predictor, dict[str, Any], TrainedCrop]:
@@ -159,6 +167,33 @@ def _read_marks(path: str, store: EpisodeStore, episodes: np.ndarray) -> Marks |
             'marks: none of the episodes that are scored is marked; mark some of them, in the '
             f'order of the recordings from 0: {listing(episodes)}; or give --all')
     return marks
+
+
+def _answer_large(network: PredictorNetwork | Predictor, training: dict[str, Any],
+                  store: EpisodeStore, episodes: np.ndarray, goal_picture: str,
+                  scores: EpisodeScores) -> list[Answer]:
+    """
+    Return answers to pictures as they were recorded, and print how good they are.
+
+    None where these are not larger; nor with z, or where goals are pictures of their own, which
+    are kept at the network's size.
+    """
+    if goal_picture == 'recorded' and any(store[i].goal_frame is not None for i in episodes):
+        return []
+    if isinstance(network, PredictorNetwork):
+        if network.config.latent_size:
+            return []
+        network = SubgoalPredictor(network, training)
+    answers = answer_at_full_size(network, store, episodes[:_LARGE], scores.match_step[:_LARGE],
+                                  training.get('settings', {}).get('crop', ''))
+    if answers:
+        word, ratio = against_copying(*(np.array([getattr(one, name) for one in answers])
+                                        for name in ('l1', 'copying')))
+        height, width = answers[0].pictures[0].shape[:2]
+        print(f'at {width}x{height} pixels, {len(answers)} episodes: {word}; error '
+              f'{np.mean([one.l1 for one in answers]):.4f}, {ratio.value:.2f} times copying '
+              f'({ratio.low:.2f}, {ratio.high:.2f})')
+    return answers
 
 
 def _summarize(count: int, drawn: SampleScores) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from tap_ros.evaluation.bottleneck import context_pixels
 from tap_ros.evaluation.hits import is_hit
 from tap_ros.evaluation.prediction import all_targets, ask
 from tap_ros.images.drawing import enlarge, GAP, grid, overlay
-from tap_ros.images.pixels import to_uint8
+from tap_ros.images.pixels import resize_image, to_uint8
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.protocol import Predictor
@@ -19,13 +19,14 @@ from tap_ros.recording.marks import Marks
 from tap_ros.training.frames import FilledStore
 import torch
 
-_SIDE = 128  # least pixels a side of a picture in a strip
+_SIDE, _MOST = 128, 256  # least and most pixels a side of a picture in a strip
 _LINE = 18  # pixels between lines of text
 
 
 def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
                 episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-                filled: FilledStore | None = None, marks: Marks | None = None) -> np.ndarray:
+                filled: FilledStore | None = None, marks: Marks | None = None,
+                large: Sequence[Sequence[np.ndarray]] = ()) -> np.ndarray:
     """
     Draw a sheet of strips, a row for each episode.
 
@@ -35,6 +36,7 @@ def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
 
     :param network: as for prediction.evaluate; filled: likewise.
     :param goal_picture: see batches.make_batch.
+    :param large: of each episode the pictures to draw instead, in that order, of any size.
     :return: uint8 (height, width, 3).
     """
     batch = all_targets(network, store, episodes, goal_picture, filled)
@@ -46,16 +48,21 @@ def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
     paints = isinstance(network, PredictorNetwork) and network.config.new_pixels
     scale, titles = -(-_SIDE // images.shape[1]), ['', 'start', 'prediction', 'matched frame']
     titles += ['goal'] * (batch.context.shape[1] - 1)
+    if large:
+        recorded = large[0][0].shape[:2]
+        size = tuple(round(side * min(1, _MOST / max(recorded))) for side in recorded)
     rows = []
     for b, i in enumerate(map(int, episodes)):
         at, last = int(batch.times[b, match[b]]), int(batch.end[b])
         window = marks.episodes.get(i, ()) if marks else ()
         start, *goal = batch.context[b].numpy()
-        panels = [start, images[b], batch.targets[b, match[b]].numpy(), *goal]
+        panels = list(large[b]) if large else [
+            start, images[b], batch.targets[b, match[b]].numpy(), *goal]
         pixels = context_pixels(store[i], goal_picture)
         if pixels.size and np.isfinite(pixels).all() and not paints:
             panels.append(overlay(images[b], maps_of(b, pixels).maps.cpu().numpy()))
-        panels = [enlarge(panel, scale) for panel in panels]
+        panels = [resize_image(panel, size) if large else enlarge(panel, scale)
+                  for panel in panels]
         hit = ['hit' if is_hit(window, at) else 'next to it' if is_hit(window, at, 1) else 'miss']
         said = write_lines([f'episode {i}', f'{at} of {last}', *hit * bool(window)],
                            panels[0].shape[:2])

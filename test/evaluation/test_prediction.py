@@ -17,6 +17,7 @@ from tap_ros.apps.evaluate_prediction import Options, run
 from tap_ros.base.errors import ConfigError, ImageError, RecordingWarning
 from tap_ros.base.options import parse
 from tap_ros.evaluation.bottleneck import bottleneck_scores
+from tap_ros.evaluation.full_size import answer_at_full_size
 from tap_ros.evaluation.hits import seconds_off
 from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.evaluation.prediction import evaluate, verdict
@@ -28,6 +29,7 @@ from tap_ros.prediction.retrieval import ends_of
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
+from tap_ros.recording.reading import Reading
 from tap_ros.weights.weights import save_weights
 import torch
 
@@ -231,6 +233,35 @@ def test_recordings_of_another_camera_are_not_cut_elsewhere_without_a_word(tmp_p
             found.append(SimpleNamespace(message=error))
     said = [str(one.message) for one in found if 'trained on' in str(one.message)]
     assert bool(said) == bool(told) and all(re.search(told, text) for text in said)
+
+
+def test_answers_are_scored_at_the_size_that_was_recorded(tmp_path):
+    episodes = [move_squares([[9, 9]], [[50, 50]], size=2 * SIZE, seed=seed) for seed in range(2)]
+    bag = write_bag(tmp_path / 'bag', episodes)
+    store = open_recordings(bag, reading=Reading(size=SIZE), progress=False)
+    remembers = SimpleNamespace(
+        mode='bidirectional', full_size=True, image_size=(SIZE, SIZE),
+        predict_together=lambda requests: [[SimpleNamespace(image=next(
+            one.frames[4] for one in episodes if (one.frames[0] == request.start).all()))]
+            for request in requests])
+    found = answer_at_full_size(remembers, store, [0, 1], [4, 3])
+    assert found[0].l1 == 0 < found[0].copying and found[1].l1 > 0
+    np.testing.assert_array_equal(found[1].pictures, episodes[1].frames[[0, 4, 3, -1]])
+    remembers.image_size = (2 * SIZE, 2 * SIZE)
+    assert not answer_at_full_size(remembers, store, [0], [4])
+
+
+def test_the_command_scores_and_draws_pictures_as_they_were_recorded(tmp_path, capsys):
+    bag = write_bag(tmp_path / 'bag', [
+        move_squares([[9, 9]], [[50, 50]], size=2 * SIZE, seed=seed, goal_frame=None)
+        for seed in range(5)])
+    weights, made = tmp_path / 'weights.safetensors', network()
+    save_weights(weights, made, 'predictor', made.config, {'settings': {'size': SIZE}})
+    score(['--weights', str(weights), '--recordings', str(bag), '--all', '--out', str(tmp_path)])
+    assert 'at 64x64 pixels, 5 episodes:' in capsys.readouterr().out
+    found = json.loads((tmp_path / 'scores.json').read_text())['scores']['full_size']
+    assert len(found['l1']) == len(found['copying']) == 5
+    assert cv2.imread(str(tmp_path / 'pictures.png')).shape[0] > 5 * 2 * SIZE
 
 
 @pytest.mark.parametrize('options', [
