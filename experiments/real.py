@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from tap_ros.apps.label_command import frames_of
 from tap_ros.apps.train import train
+from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File, Folder, Topic
 from tap_ros.evaluation.hits import seconds_off
@@ -48,7 +49,7 @@ class Options:
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param marks: demonstrations that are marked in each draw.
     :param held_out: demonstrations that are scored in each draw.
-    :param draws: how many; draw k has the seed k.
+    :param draws: how many, each with others held out and marked; draw k has the seed k.
     :param out: folder of the trainings; those that are done are kept.
     """
 
@@ -58,7 +59,7 @@ class Options:
     image_topic: Topic = ''
     marks: int = 10
     held_out: int = 10
-    draws: int = 3
+    draws: int = 4
     out: Folder = 'runs/real'
 
 
@@ -97,8 +98,8 @@ def sheet(options: Options, truth: dict[str, dict[str, float]]) -> np.ndarray:
         folder / way.split()[0] / 'predictor.safetensors')) for way in WAYS]
     store = open_recordings(options.recordings, reading=replace(reading_like(
         predictors[0].training, [options.recordings]), size=0))
-    order, rows = np.random.default_rng(0).permutation(len(store)).tolist(), []
-    for i in sorted(order[:options.held_out])[:ROWS]:
+    rows = []
+    for i in sorted(order_of(len(store), options, 0)[:options.held_out])[:ROWS]:
         frames = store.frames(i)
         (at, _), = frames_of(store, i, np.array([truth[str(i)][f'{options.name}_s']]))
         request = Request(frames[0], frames[-1])
@@ -107,15 +108,23 @@ def sheet(options: Options, truth: dict[str, dict[str, float]]) -> np.ndarray:
     return grid(rows)
 
 
+def order_of(count: int, options: Options, draw: int) -> list[int]:
+    """Return the demonstrations in the order of a draw: those held out first, the marked last."""
+    if options.draws * options.held_out > count:
+        raise ConfigError(f'{options.draws} draws that hold out {options.held_out} need '
+                          f'{options.draws * options.held_out} demonstrations; there are {count}')
+    return np.roll(np.random.default_rng(0).permutation(count),
+                   -draw * options.held_out).tolist()
+
+
 def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
           folder: Path) -> dict[str, list[list[float]]]:
     """Return of each way the errors at the moment, those of copying there, and how many s off."""
     whole = open_recordings(options.recordings, reading=Reading(
         image_topic=options.image_topic, crop='whole', size=SIZE))
     moments = [np.array([truth[str(i)][f'{options.name}_s']]) for i in range(len(whole))]
-    order = np.random.default_rng(draw).permutation(len(whole)).tolist()
-    held_out = sorted(order[:options.held_out])
-    marked = order[options.held_out:][:options.marks]
+    order = order_of(len(whole), options, draw)
+    held_out, marked = sorted(order[:options.held_out]), order[-options.marks:]
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / 'marks.json'
     write_marks(file, whole, [options.recordings], {

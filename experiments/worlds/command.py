@@ -6,7 +6,7 @@ The command `python -m experiments worlds`: who finds the bottleneck in demonstr
 Demonstrations of other simulators, keyframes of them, and predictors trained on them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -21,6 +21,7 @@ from experiments.worlds.trained import (
     place_marks,
     SETTINGS,
     train_all,
+    WITH_MARKS,
 )
 import numpy as np
 import pandas as pd
@@ -29,7 +30,7 @@ from tap_ros.base.engines import Engine
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically, write_rows
 from tap_ros.base.options import Flag, Folder
-from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
+from tap_ros.evaluation.intervals import bootstrap, Interval, mean_interval, share_interval
 from tap_ros.images.drawing import grid
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
@@ -37,15 +38,15 @@ from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import film, fit, moments_of
 from tap_ros.training.marks import chance
 
-Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks']
+Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'three pictures']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
          'metaworld/window-open-v3', 'metaworld/drawer-open-v3',
          'metaworld/button-press-topdown-v3', 'ogbench/button', 'ogbench/cube', 'ogbench/drawer',
          'ogbench/window')
 # Tasks, and seeds of the first demonstration of two of the above, that no choice was made by.
 ASIDE = {'metaworld/faucet-open-v3': 0, 'metaworld/dial-turn-v3': 0, 'metaworld/plate-slide-v3': 0,
+         'metaworld/door-lock-v3': 0, 'metaworld/handle-press-v3': 0,
          'metaworld/button-press-topdown-v3': 5000, 'ogbench/drawer': 5000}
-HELD_OUT = 40  # demonstrations of each task
 FOUND = 0.75, 0.85  # of the demonstrations, exactly or within a frame: a task counts as found
 FRAMES = 'frames, in the bottleneck'  # a column
 
@@ -56,7 +57,8 @@ class Options:
     Options of the command.
 
     :param tasks: world/task each.
-    :param episodes: demonstrations of each task to train on; others are held out.
+    :param episodes: demonstrations of each task to train on.
+    :param held_out: others, to score.
     :param image_size: width and height in pixels, as recorded.
     :param seed: of the first demonstration.
     :param methods: that are trained on each task, beside keyframes, which need no training.
@@ -68,7 +70,8 @@ class Options:
     """
 
     tasks: tuple[str, ...] = TASKS
-    episodes: int = 100
+    episodes: int = 50
+    held_out: int = 40
     image_size: int = 128
     seed: int = 0
     methods: tuple[Method, ...] = tuple(METHODS)
@@ -84,7 +87,7 @@ def run(args):
     """Collect, draw strips of the bottlenecks, score keyframes and trainings, write the page."""
     rows, strips = score_tasks(dict.fromkeys(args.tasks, args.seed), args.methods, args)
     if args.tasks == TASKS:
-        rows += score_tasks(ASIDE, ('marks',), args, 'aside/')[0]
+        rows += score_tasks(ASIDE, WITH_MARKS, replace(args, seeds=1), 'aside/')[0]
     out = Path(args.out)
     write_rows(out / 'worlds.json', rows)
     write_atomically(out / 'worlds.md', page(rows))
@@ -105,8 +108,9 @@ def score_tasks(tasks, methods, args, prefix=''):
         world, _, task = name.partition('/')
         folders[prefix + name] = folder = Path(args.bags, prefix, world, task)
         if not args.results_only:
-            for bag, episodes, seed in ((folder, args.episodes, first_seed),
-                                        (held_out_of(folder), HELD_OUT, first_seed + 10 ** 6)):
+            for bag, episodes, seed in (
+                    (folder, args.episodes, first_seed),
+                    (held_out_of(folder), args.held_out, first_seed + 10 ** 6)):
                 collect(bag, CollectConfig(
                     world=world, task=task, episodes=episodes, seed=seed,
                     image_size=args.image_size, episodes_per_file=10), args.engine,
@@ -201,8 +205,12 @@ def average(rows):
     for row in rows:
         found.setdefault((row['task'], row['method']), []).append(row)
     return [{'task': task, 'method': method, 'n': len(same[0]['hit']), 'seeds': len(same), **{
-        key: Interval(*map(float, _interval([row[key] for row in same])))._asdict()
-        for key in ('hit', 'near')}} for (task, method), same in found.items()]
+        key: Interval(*map(float, value))._asdict() for key, value in {
+            **{name: _interval([row[name] for row in same]) for name in ('hit', 'near')},
+            'error': bootstrap(
+                lambda error, copying: error.mean((0, -1)) / copying.mean((0, -1)),
+                *(np.array([row[name] for row in same]) for name in ('error', 'copying')))
+        }.items()}} for (task, method), same in found.items()]
 
 
 def page(rows):
@@ -219,12 +227,13 @@ def page(rows):
             lengths[task] = f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f}"
         line = tables[kind].setdefault(task, {
             'task': task.removeprefix('aside/').replace('/', ' '), FRAMES: lengths[task]})
-        line[method] = f"{hit['value']:.0%}, {near['value']:.0%}"
+        line[method] = f"{hit['value']:.0%}, {near['value']:.0%}" + (
+            f"; {row['error']['value']:.2f}" if method in WITH_MARKS and 'error' in row else '')
         found[kind].setdefault(method, []).append(
             any(value['value'] >= least for value, least in zip((hit, near), FOUND)))
     for kind, lines in tables.items():
         lines['found'] = {'task': '**found**', FRAMES: ''} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
-    return render('worlds/templates/worlds.md.j2', marked=MARKED, held_out=HELD_OUT,
+    return render('worlds/templates/worlds.md.j2', marked=MARKED,
                   seeds=seeds['trained'], seeds_aside=seeds['aside'].get('marks'),
                   **{kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})

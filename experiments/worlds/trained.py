@@ -14,13 +14,15 @@ from tqdm import tqdm
 MARKED = 10  # demonstrations of each task, others in each training
 # A name in tables: settings beside those that all have.
 METHODS = {
-    'fix': {'loss': 'fix'},
-    'over time': {'selection': 'absolute'},
-    'relative': {},
-    'progress': {'selection': 'progress', 'progress_margin': 0.5},
-    'still': {'selection': 'still'},
+    'fix': {'loss': 'fix', 'steps': 400},
+    'over time': {'selection': 'absolute', 'steps': 400},
+    'relative': {'steps': 400},
+    'progress': {'selection': 'progress', 'progress_margin': 0.5, 'steps': 400},
+    'still': {'selection': 'still', 'steps': 400},
     'marks': {'selection': 'marks'},
+    'three pictures': {'selection': 'marks', 'keyframes': True, 'new_pixels': False},
 }
+WITH_MARKS = 'marks', 'three pictures'
 SETTINGS = {'recipe': 'foreign', 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
 
 
@@ -55,7 +57,7 @@ def mark(folder, demonstrations, seed):
 
 
 def train_all(folders, methods, seeds, out, engine):
-    """Train and score all that is not done; return rows with hit, near: 0 or 1 an episode."""
+    """Train and score all that is not done; return rows of what train_and_score returns."""
     work = [Work(f'{task}/{method}/{seed}', train_and_score, (
                 str(folder), method, seed, str(Path(out, task, f'{method}_{seed}'))))
             for seed in range(seeds) for task, folder in folders.items() for method in methods]
@@ -69,7 +71,12 @@ def train_all(folders, methods, seeds, out, engine):
 
 
 def train_and_score(folder, method, seed, out):
-    """Train a predictor; return which held-out episodes it hits, exactly and within a frame."""
+    """
+    Train a predictor and score it on the held-out episodes whose bottleneck is known.
+
+    :return: dict of lists (N,): hit and near, 0 or 1, is the nearest frame in the bottleneck, or
+        at most one beside it; error, of its middle frame; copying, of an input against that.
+    """
     from sim_bridge.collect import BOTTLENECKS_FILE
     from tap_ros.apps.train import train
     from tap_ros.evaluation.hits import is_hit
@@ -79,11 +86,11 @@ def train_and_score(folder, method, seed, out):
     from tap_ros.recording.cache import open_recordings
     from tap_ros.recording.marks import read_marks
     import torch
-    path = Path(out, 'hits.json')
+    path = Path(out, 'scores.json')
     if path.exists():
         return json.loads(path.read_text())
     torch.set_num_threads(1)
-    marks = {'marks': str(marks_of(folder, seed))} if 'marks' in method else {}
+    marks = {'marks': str(marks_of(folder, seed))} if method in WITH_MARKS else {}
     Path(out).mkdir(parents=True, exist_ok=True)
     with open(Path(out, 'log.txt'), 'a') as log, redirect_stderr(log):
         weights = train(folder, out, seed=seed, held_out=(str(held_out_of(folder)),),
@@ -93,8 +100,9 @@ def train_and_score(folder, method, seed, out):
     store = open_recordings([bag], reading=reading_like(training, [bag]))
     truth = read_marks(bag / BOTTLENECKS_FILE, store).episodes
     known = sorted(truth)
-    matched = evaluate(network, store, known)['prediction'].match_step
-    scores = {name: [int(is_hit(truth[i], t, beside)) for i, t in zip(known, matched)]
-              for name, beside in (('hit', 0), ('near', 1))}
+    found = evaluate(network, store, known, marks=truth)['prediction']
+    scores = {name: [int(is_hit(truth[i], t, beside)) for i, t in zip(known, found.match_step)]
+              for name, beside in (('hit', 0), ('near', 1))} | {
+        'error': found.at_mark.tolist(), 'copying': found.copying_at_mark.tolist()}
     write_atomically(path, json.dumps(scores) + '\n')
     return scores
