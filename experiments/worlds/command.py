@@ -234,6 +234,7 @@ def page(rows):
     for kind, lines in tables.items():
         lines['found'] = {'task': '**found**', FRAMES: ''} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
-    return render('worlds/templates/worlds.md.j2', marked=MARKED,
-                  seeds=seeds['trained'], seeds_aside=seeds['aside'].get('marks'),
-                  **{kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})
+    return render('worlds/templates/worlds.md.j2', marked=MARKED, seeds=seeds['trained'],
+                  held_out=max((row['n'] for row in rows if 'seeds' in row), default=0),
+                  seeds_aside=seeds['aside'].get('marks'), **{
+                      kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})
