@@ -46,6 +46,7 @@ from tap_ros.recording.episode import Episode, EpisodeTable
 from tap_ros.recording.mcap_file import bytes_of, McapFile
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
+from tap_ros.recording.sqlite_file import parts_of, stats_of
 from tap_ros.recording.topic_choice import Bag, list_paths
 from tqdm import tqdm
 
@@ -61,7 +62,7 @@ class EpisodeStore:
 
     :param tables: list of EpisodeTable.
     :param file_hashes: hex digests of the files, in order, and what else tells them apart.
-    :param sources: of each table, the first file of its bag.
+    :param bags: that of each table.
     :ivar image_size: (height, width) of the frames.
     :ivar camera_size: likewise, as they were recorded; None where that differs.
     :ivar cameras: topics of the cameras, sorted.
@@ -69,10 +70,9 @@ class EpisodeStore:
     """
 
     def __init__(self, tables: Sequence[EpisodeTable], file_hashes: Iterable[str],
-                 sources: Sequence[Path]) -> None:
+                 bags: Sequence[Bag]) -> None:
         self._index = [(table, i) for table in tables for i in range(len(table))]
-        self._sources = [source for table, source in zip(tables, sources, strict=True)
-                         for _ in range(len(table))]
+        self._bags = [bag for table, bag in zip(tables, bags, strict=True) for _ in table.spans]
         lengths = [np.diff(table.starts) for table in tables]
         self.lengths = np.concatenate([np.empty(0, np.int64), *lengths])  # (E,) frames
         self.num_frames = int(self.lengths.sum())
@@ -97,9 +97,13 @@ class EpisodeStore:
         """Yield the episodes."""
         return (self[i] for i in range(len(self)))
 
+    def bag(self, i: int) -> Bag:
+        """Return the bag that episode i is in."""
+        return self._bags[i]
+
     def source(self, i: int) -> Path:
         """Return the first file of the bag that episode i is in."""
-        return self._sources[i]
+        return self._bags[i].files[0]
 
     def frames(self, i: int) -> np.ndarray:
         """Return the frames of episode i, (T, H, W, 3) uint8."""
@@ -179,7 +183,7 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     # Episodes of the files that follow each other.
     arms = [read_mount(bag.files[0].parent) for bag in bags]
     cutting = for_bags(reading, len(found))
-    runs = [(assemble(run, arm, cutting), bag.files[0])
+    runs = [(assemble(run, arm, cutting), bag)
             for parts, arm, bag in zip(columns, arms, bags) for run in runs_of(parts)]
     apart: list[Any] = [asdict(arm) for arm in arms if arm != ArmMount()]
     if len(reading.cameras) > 1:
@@ -189,7 +193,7 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     store = EpisodeStore(
         [table for table, _ in runs],
         [*(digests[path] for bag in bags for path in bag.files), *map(json.dumps, apart)],
-        [source for _, source in runs])
+        [bag for _, bag in runs])
     if not len(store):
         raise RecordingError(f'{found[0].source}: no camera image lies within an episode')
     return store
@@ -204,23 +208,21 @@ def _digest(cache: Path, path: Path) -> str:
     """Return the SHA-256 of a file; of one that was read before and not changed since, as then."""
     if not path.is_file():
         bytes_of(path)  # says why it cannot be read
-    parts = [path, *filter(Path.is_file, [path.with_name(f'{path.name}-wal')])]  # of sqlite
 
     def read() -> str:
-        with open(path, 'rb') as stream:
-            digest = hashlib.file_digest(stream, 'sha256')
-        for log in parts[1:]:
-            digest.update(log.read_bytes())
-        return digest.hexdigest()
+        try:
+            with open(path, 'rb') as stream:
+                digest = hashlib.file_digest(stream, 'sha256')
+            for log in parts_of(path)[1:]:
+                digest.update(log.read_bytes())
+            return digest.hexdigest()
+        except OSError as error:
+            raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
 
-    try:
-        stats = [(one.st_size, one.st_ino, one.st_mtime_ns, one.st_ctime_ns)
-                 for one in map(os.stat, parts)]
-        if time.time_ns() - max(max(one[2:]) for one in stats) < _SETTLED_NS:
-            return read()
-        return str(_remembered(cache, ['file', str(path.resolve()), stats], read))
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
+    stats = stats_of(path)
+    if time.time_ns() - max(max(one[2:]) for one in stats) < _SETTLED_NS:
+        return read()
+    return str(_remembered(cache, ['file', str(path.resolve()), stats], read))
 
 
 def _remembered(cache: Path, key: list[Any], find: Callable[[], Any]) -> Any:

@@ -96,6 +96,24 @@ class SqliteFile(McapFile):
         return sqlite3.connect(f'{path.absolute().as_uri()}?{way}', uri=True)
 
 
+def parts_of(path: Path) -> list[Path]:
+    """Return what a file of a bag consists of: itself, and a log of sqlite's that it may have."""
+    return [path, *filter(Path.is_file, [path.with_name(f'{path.name}-wal')])]
+
+
+def stats_of(path: Path) -> tuple[tuple[int, ...], ...]:
+    """
+    Return what tells whether a file has changed: of each part bytes, inode, two times in ns.
+
+    :raises RecordingError: when it is not there.
+    """
+    try:
+        return tuple((one.st_size, one.st_ino, one.st_mtime_ns, one.st_ctime_ns)
+                     for one in map(os.stat, parts_of(path)))
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
+
+
 def open_file(path: Path) -> McapFile:
     """
     Open one file of a bag.
