@@ -18,8 +18,9 @@ from tap_ros.base.errors import ConfigError, RecordingError, RecordingWarning
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import CENTRE, TrainedCrop
 from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number, natural
+from tap_ros.recording.raw_files import beginning, stats_of
 from tap_ros.recording.reading import Reading
-from tap_ros.recording.sqlite_file import beginning, SQLITE, stats_of
+from tap_ros.recording.sqlite_file import SQLITE
 from tap_ros.recording.topic_choice import Bag, list_paths, total
 
 VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')

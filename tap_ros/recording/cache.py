@@ -8,7 +8,7 @@ its pictures as uint8 arrays, and all else as columns. Any number of processes m
 it at once.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
@@ -22,7 +22,6 @@ import os
 from pathlib import Path
 import shutil
 import tempfile
-import time
 from typing import Any
 import warnings
 
@@ -43,17 +42,14 @@ from tap_ros.recording.align import assemble, runs_of
 from tap_ros.recording.bags import find_bags, Paths
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
 from tap_ros.recording.episode import Episode, EpisodeTable
-from tap_ros.recording.mcap_file import bytes_of, McapFile
+from tap_ros.recording.known import cache_folder, digest_of, ENVIRONMENT, FORMAT, remembered
+from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.metadata import ArmMount, read_mount
-from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
-from tap_ros.recording.sqlite_file import parts_of, stats_of
+from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.topic_choice import Bag, list_paths
 from tqdm import tqdm
 
-FORMAT = 10  # of a cache folder; another number makes all files be decoded again
-ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
-_SETTLED_NS = 2 * 10**9  # a file changed later may change again and show the same time
 
 
 class EpisodeStore:
@@ -161,10 +157,10 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     # What each file is, and which topics are read: known from before, or found out.
     files = list(dict.fromkeys(chain.from_iterable(bag.files for bag in bags)))
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        digests = dict(zip(files, pool.map(partial(_digest, cache), files)))
+        digests = dict(zip(files, pool.map(partial(digest_of, cache), files)))
     choices = [
-        _remembered(cache, ['topics', camera, *map(digests.__getitem__, bag.files)],
-                    lambda: asdict(bag.choose(camera)))  # noqa: B023  it is called at once
+        remembered(cache, ['topics', camera, *map(digests.__getitem__, bag.files)],
+                   lambda: asdict(bag.choose(camera)))  # noqa: B023  it is called at once
         for bag, camera in zip(bags, cameras)]
     for bag, choice in zip(bags, choices):
         for doubt in choice['doubts']:
@@ -182,7 +178,7 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     _check_sizes(list(chain(*columns)))
     # Episodes of the files that follow each other.
     arms = [read_mount(bag.files[0].parent) for bag in bags]
-    cutting = for_bags(reading, len(found))
+    cutting = reading if len(found) == 1 else replace(reading, episode_seconds=0)
     runs = [(assemble(run, arm, cutting), bag)
             for parts, arm, bag in zip(columns, arms, bags) for run in runs_of(parts)]
     apart: list[Any] = [asdict(arm) for arm in arms if arm != ArmMount()]
@@ -197,44 +193,6 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     if not len(store):
         raise RecordingError(f'{found[0].source}: no camera image lies within an episode')
     return store
-
-
-def cache_folder() -> Path:
-    """Return the folder of the cache: $TAP_ROS_CACHE or ~/.cache/tap_ros."""
-    return Path(os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
-
-
-def _digest(cache: Path, path: Path) -> str:
-    """Return the SHA-256 of a file; of one that was read before and not changed since, as then."""
-    if not path.is_file():
-        bytes_of(path)  # says why it cannot be read
-
-    def read() -> str:
-        try:
-            with open(path, 'rb') as stream:
-                digest = hashlib.file_digest(stream, 'sha256')
-            for log in parts_of(path)[1:]:
-                digest.update(log.read_bytes())
-            return digest.hexdigest()
-        except OSError as error:
-            raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
-
-    stats = stats_of(path)
-    if time.time_ns() - max(max(one[2:]) for one in stats) < _SETTLED_NS:
-        return read()
-    return str(_remembered(cache, ['file', str(path.resolve()), stats], read))
-
-
-def _remembered(cache: Path, key: list[Any], find: Callable[[], Any]) -> Any:
-    """Return what was found before by a key; else find and keep it. JSON holds both."""
-    path = cache / 'known' / hashlib.sha256(json.dumps([FORMAT, *key]).encode()).hexdigest()
-    with suppress(OSError, ValueError):
-        return json.loads(path.read_text())
-    value = find()
-    with suppress(OSError):  # who decodes into the cache says so
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(value))
-    return value
 
 
 def _check_first_sizes(sizes: set[tuple[int, ...]], reading: Reading, network: str) -> None:

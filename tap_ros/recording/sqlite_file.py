@@ -14,9 +14,9 @@ from mcap.summary import Summary
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.text import escaped
 from tap_ros.recording.defects import Defect, FAR
-from tap_ros.recording.mcap_file import bytes_of, Channel, Found, McapFile
+from tap_ros.recording.mcap_file import Channel, Found, McapFile
 from tap_ros.recording.metadata import PACKED
-import zstandard
+from tap_ros.recording.raw_files import beginning, bytes_of
 
 SQLITE = b'SQLite format 3\0'
 
@@ -96,24 +96,6 @@ class SqliteFile(McapFile):
         return sqlite3.connect(f'{path.absolute().as_uri()}?{way}', uri=True)
 
 
-def parts_of(path: Path) -> list[Path]:
-    """Return what a file of a bag consists of: itself, and a log of sqlite's that it may have."""
-    return [path, *filter(Path.is_file, [path.with_name(f'{path.name}-wal')])]
-
-
-def stats_of(path: Path) -> tuple[tuple[int, ...], ...]:
-    """
-    Return what tells whether a file has changed: of each part bytes, inode, two times in ns.
-
-    :raises RecordingError: when it is not there.
-    """
-    try:
-        return tuple((one.st_size, one.st_ino, one.st_mtime_ns, one.st_ctime_ns)
-                     for one in map(os.stat, parts_of(path)))
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
-
-
 def open_file(path: Path) -> McapFile:
     """
     Open one file of a bag.
@@ -121,18 +103,3 @@ def open_file(path: Path) -> McapFile:
     :raises RecordingError: as McapFile.
     """
     return (SqliteFile if beginning(path).startswith(SQLITE) else McapFile)(path)
-
-
-def beginning(path: Path) -> bytes:
-    """Return how a file begins, unpacked; nothing of what is no file."""
-    try:
-        if path.is_file():  # opening a FIFO would wait for its writer
-            with open(path, 'rb') as stream:
-                start = stream.read(32)
-                if not start.startswith(zstandard.FRAME_HEADER):
-                    return start
-                stream.seek(0)
-                return zstandard.ZstdDecompressor().stream_reader(stream).read(32)
-    except (OSError, zstandard.ZstdError):
-        pass  # who reads it says why
-    return b''

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tap_ros.apps.cli import main
 from tap_ros.base.errors import ConfigError
-from tap_ros.recording import cache as cache_module
+from tap_ros.recording import known
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks, write_marks
 from tap_ros.recording.mcap_file import McapFile
@@ -143,7 +143,7 @@ def test_a_training_opens_and_hashes_each_file_once(tmp_path, monkeypatch):
     write_marks(path, open_recordings([bag], tmp_path / 'other', progress=False), [bag], {
         i: [(4, 4)] for i in range(10)})
     monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
-    monkeypatch.setattr(cache_module, '_SETTLED_NS', 0)  # files made just now count as old ones
+    monkeypatch.setattr(known, '_SETTLED_NS', 0)  # files made just now count as old ones
     done = Counter()
 
     def counted(what, function):
