@@ -251,12 +251,7 @@ class LearnedForwardModel(nn.Module):
 
     def rollout(self, features: torch.Tensor, gripper: torch.Tensor,
                 actions: torch.Tensor) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        """
-        Yield flow and masks, see advance, after each step of action sequences.
-
-        :param features: (N, C, n, n) of the Look; gripper: (N, 4) where each sequence begins.
-        :param actions: (N, T, 4).
-        """
+        """Yield flow and masks, see advance, after each of actions (N, T, 4) from (N, 4)."""
         flow = self.still(len(actions))
         for action in actions.unbind(1):
             flow, gripper, masks = self.advance(features, flow, gripper, action)
