@@ -38,10 +38,9 @@ class Camera:
     def extrinsics(self) -> np.ndarray:
         """World to camera, 3x4, metres; the camera looks along +z, x right, y down."""
         c, s = np.cos(self.tilt), np.sin(self.tilt)
-        rotation = np.array([[1, 0, 0], [0, -c, -s], [0, s, -c]])
-        if self.turn:
-            c, s = np.cos(self.turn), np.sin(self.turn)
-            rotation = rotation @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        tilt = np.array([[1, 0, 0], [0, -c, -s], [0, s, -c]])
+        c, s = np.cos(self.turn), np.sin(self.turn)
+        rotation = tilt @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         return np.column_stack([rotation, -rotation @ np.array(self.position)])
 
     @property
