@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 from experiments.pages import markdown, render
+from experiments.tables import reached
 import numpy as np
 from pandas import DataFrame
 from PIL import Image
@@ -182,8 +183,7 @@ def table(found: dict[str, list[dict[str, float]]]) -> str:
         line['its median'] = f'{np.median(each["full"]):.2f}'
         line['better than enlarged in'] = (
             f'{(each["full"] < each["enlarged"]).mean():.0%} of {len(scores)}')
-        line['aim'] = '' if aim is None else (
-            'reached' if ours.value <= aim else '**missed**') + f': {aim:g}'
+        line['aim'] = '' if aim is None else reached(ours.value <= aim, f'{aim:g}')
         lines.append(line)
     return markdown(DataFrame(lines), 2)
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import re
 import sys
 
+from experiments import pages
 from experiments.bench.rows import Row
 from experiments.paper.published import BOTTLENECK_2PX, GAINS, TABLE_2
 import pandas as pd
@@ -217,9 +218,8 @@ class Tables:
 
 def markdown(lines, head=('claim', 'paper', 'here', 'aim')):
     """Write lines as a table, without the columns that are empty."""
-    columns = [column for column in zip(head, *lines, strict=True) if any(column[1:])]
-    head, *lines = zip(*columns, strict=True)
-    return ''.join(f'| {" | ".join(row)} |\n' for row in (head, ('---',) * len(head), *lines))
+    table = pd.DataFrame(lines, columns=head)
+    return pages.markdown(table.loc[:, (table != '').any()], left=len(head)) + '\n'
 
 
 def page_path(name):

@@ -8,7 +8,6 @@ that x is to the right and y away from the camera, which stands opposite the rob
 """
 
 from dataclasses import replace
-from difflib import get_close_matches
 from typing import Any
 import warnings
 
@@ -24,6 +23,7 @@ from tap_ros.base.contract import (
     ROBOT_MASK_HAND,
 )
 from tap_ros.base.errors import ConfigError, SceneError
+from tap_ros.base.text import meant
 
 ORIGIN = np.array([0.0, 0.65, 0.01])  # m, of our frame in Meta-World's
 TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about the vertical
@@ -188,10 +188,8 @@ def make_env(task: str) -> tuple[Any, Any]:
             'world metaworld: Meta-World is not installed; type `pip install --no-deps -r '
             'requirements-worlds.txt` in the folder of tap_ros') from error
     if task not in ALL_V3_ENVIRONMENTS:
-        near = get_close_matches(task, ALL_V3_ENVIRONMENTS, 1)
-        meant = f'did you mean {near[0]!r}? ' if near else ''
-        raise SceneError(
-            f'task {task!r} is unknown; {meant}valid: {", ".join(ALL_V3_ENVIRONMENTS)}')
+        raise SceneError(f'task {task!r} is unknown; {meant(task, ALL_V3_ENVIRONMENTS)}valid: '
+                         + ', '.join(ALL_V3_ENVIRONMENTS))
     # Meta-World 3.1 writes rows of 11 numbers; MuJoCo 4 has 12.
     setattr(sawyer_xyz_env.SawyerMocapBase, 'reset_mocap_welds', _reset_mocap_welds)  # noqa: B010
     env = ALL_V3_ENVIRONMENTS[task]()

@@ -8,6 +8,7 @@ import json
 import os
 from pathlib import Path
 import platform
+import re
 import time
 
 from tap_ros.base.files import write_atomically
@@ -44,8 +45,6 @@ def run(args):
 
 def processor():
     """Return what kind of processor this is, and whether it multiplies matrices of bfloat16."""
-    lines = dict(line.split(':', 1) for line in Path('/proc/cpuinfo').read_text().splitlines()
-                 if ':' in line)
-    fields = {name.strip(): value.strip() for name, value in lines.items()}
-    return fields.get('model name', platform.machine()) + (
-        ' with AMX' if 'amx_bf16' in fields.get('flags', '') else '')
+    told = Path('/proc/cpuinfo').read_text()
+    name = re.search(r'model name\s*: (.*)', told)
+    return (name[1] if name else platform.machine()) + ' with AMX' * ('amx_bf16' in told)

@@ -12,9 +12,6 @@ from experiments.paper.runs import label
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 
-_KEYS = {'name', 'task', 'mode', 'method', 'new_pixels', 'seed', 'scale', 'command', 'config',
-         'data', 'training', 'evaluation'}
-
 
 def load_runs(folder):
     """Read the files SCALE/RUN.json; methods are named as runs.label has it."""
@@ -25,10 +22,6 @@ def load_runs(folder):
         except ValueError as error:
             raise ConfigError(
                 f'{path}: is damaged ({error}); remove it and run it again') from None
-        missing = _KEYS - set(run)
-        if missing:
-            raise ConfigError(f'{path}: lacks {", ".join(sorted(missing))}; remove it and run it '
-                              'again')
         run['method'] = label(run['method'], run.get('variant', ''), run.get('recursion', 1))
         runs.append(run)
     return runs

@@ -48,8 +48,6 @@ VARIANTS = {
     '+skips+frame': {**_OURS, 'colour': False, 'brightness': 0.0, 'kl_warmup': 0.4,
                      'posterior_std': 0.1, 'free_nats': 0.0, 'kl_weight': 1e-5,
                      'posterior': 'frame', 'num_targets': 3},
-    # Of the tasks in FINE_TUNED, from fresh weights.
-    '+skips+scratch': _OURS,
     '+skips+long': _OURS,
     # For subgoals that are predicted again from where the first one was reached.
     '+skips+rounds': {**_OURS, 'start_crop': 0.6},
@@ -97,8 +95,7 @@ class PaperRun:
     @property
     def beginning(self):
         """Name of the shipped weights that it begins with, '' for fresh ones."""
-        fresh = self.variant in ('', '+skips+scratch')
-        return '' if fresh else FINE_TUNED.get(self.task, '')
+        return FINE_TUNED.get(self.task, '') if self.variant else ''
 
     @property
     def shifted(self):
@@ -147,7 +144,6 @@ def paper_runs():
     add(['push2'], relative + l1_rows, variant=OURS, new_pixels=False, main=True)
     # For planning where the order matters.
     add(['order2', 'order3'], relative + l1_rows[:3], variant=OURS, new_pixels=False)
-    add(['order2'], relative + l1_rows[:2], variant='+skips+scratch', new_pixels=False)
     add(['order3'], relative, variant='+skips+pieces', new_pixels=False)
     add(['order2', 'order3'], relative + ['fix-wo-gan'], variant='+skips+rounds', new_pixels=False)
     for variant in (OURS, '+skips+rounds'):

@@ -20,7 +20,7 @@ _NAMES = {'fix': 'fix-wo-gan+skips', 'genmin': 'genmin-wo-gan+skips',
           'genmin+progress': 'genmin-wo-gan+progress+skips',
           'genmin+relative': 'genmin-wo-gan+relative+skips'}
 RUNS = {base + suffix: name + text for base, name in _NAMES.items() for suffix, text in (
-    ('', ''), ('+rounds', '+rounds'), ('+scratch', '+scratch'), ('-r2', '-r2'))}
+    ('', ''), ('+rounds', '+rounds'), ('-r2', '-r2'))}
 TRAINED = 'runs/paper/small/{task}-bidirectional-{name}{warp}-s0/predictor.safetensors'
 # Options that change numbers, for the command that makes them again, with what is usual.
 TOLD = (('look', DEFAULT_LOOK), ('seed', 0), ('preset', 'default'), ('solver', 'cem'),

@@ -14,6 +14,7 @@ Before each push the expert tries all orders in the simulator, see find_order.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import permutations
 from typing import ClassVar
 
@@ -150,14 +151,14 @@ def find_order(table: Table, moment: Moment, goals: np.ndarray, todo: Sequence[i
     :param rng: numpy Generator.
     :return: todo in the order after which all objects lie nearest to their goals.
     """
-    after: dict[tuple[int, ...], tuple[Moment, float]] = {(): (moment, 0.0)}
-    orders = list(permutations(todo))
-    for order in orders:
-        for n in range(1, len(order) + 1):
-            if order[:n] not in after:
-                before, _ = after[order[:n - 1]]
-                after[order[:n]] = best_push(table, before, goals, order[n - 1], rng)
-    return min(orders, key=lambda order: after[order][1])
+    @cache  # orders begin alike
+    def after(order: tuple[int, ...]) -> tuple[Moment, float]:
+        if not order:
+            return moment, 0.0
+        before, _ = after(order[:-1])
+        return best_push(table, before, goals, order[-1], rng)
+
+    return min(permutations(todo), key=lambda order: after(order)[1])
 
 
 def best_push(table: Table, moment: Moment, goals: np.ndarray, k: int,

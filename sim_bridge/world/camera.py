@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera's geometry, and off-screen rendering."""
 
-from collections.abc import Iterator
 import contextlib
 from dataclasses import dataclass
 import os
@@ -39,10 +38,9 @@ class Camera:
     def extrinsics(self) -> np.ndarray:
         """World to camera, 3x4, metres; the camera looks along +z, x right, y down."""
         c, s = np.cos(self.tilt), np.sin(self.tilt)
-        rotation = np.array([[1, 0, 0], [0, -c, -s], [0, s, -c]])
-        if self.turn:
-            c, s = np.cos(self.turn), np.sin(self.turn)
-            rotation = rotation @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        tilt = np.array([[1, 0, 0], [0, -c, -s], [0, s, -c]])
+        c, s = np.cos(self.turn), np.sin(self.turn)
+        rotation = tilt @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         return np.column_stack([rotation, -rotation @ np.array(self.position)])
 
     @property
@@ -106,21 +104,6 @@ class OneCamera:
         return self.camera.pose
 
 
-@contextlib.contextmanager
-def drawing() -> Iterator[None]:
-    """Raise SceneError, with the remedy, where MuJoCo cannot draw off-screen."""
-    try:
-        with warnings.catch_warnings(action='ignore'):
-            if GL_PROBLEM:
-                raise OSError(GL_PROBLEM)
-            yield
-    except Exception as error:
-        raise SceneError(
-            f"cannot render off-screen with MUJOCO_GL={escaped(os.environ['MUJOCO_GL'])} "
-            f'({escaped(error)}); set MUJOCO_GL=egl, and on Debian and Ubuntu: apt-get install '
-            'libegl1 libgl1-mesa-dri') from error
-
-
 class Renderer(mujoco.Renderer):  # type: ignore[misc]  # MuJoCo has no types
     """
     Draws off-screen without what is slow there, in 7 ms, not 300; belongs to its thread.
@@ -138,8 +121,16 @@ class Renderer(mujoco.Renderer):  # type: ignore[misc]  # MuJoCo has no types
             import triton  # noqa: F401
         model.vis.quality.offsamples = model.vis.quality.shadowsize = 0
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        with drawing():
-            super().__init__(model, height, width, most_geoms)
+        try:
+            with warnings.catch_warnings(action='ignore'):
+                if GL_PROBLEM:
+                    raise OSError(GL_PROBLEM)
+                super().__init__(model, height, width, most_geoms)
+        except Exception as error:
+            raise SceneError(
+                f"cannot render off-screen with MUJOCO_GL={escaped(os.environ['MUJOCO_GL'])} "
+                f'({escaped(error)}); set MUJOCO_GL=egl, and on Debian and Ubuntu: apt-get '
+                'install libegl1 libgl1-mesa-dri') from error
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self.scene.flags[flag] = False
 

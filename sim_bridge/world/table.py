@@ -28,8 +28,6 @@ from tap_ros.base.errors import KinematicsError, SceneError
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
-if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
-    raise SceneError(f'the control period {CONTROL_PERIOD} s is no multiple of {TIMESTEP} s')
 RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time to catch up
 SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)  # of a move, to which an arm shortens what is too fast
 BENT = 0.1  # share of the fingers' travel that they may be beyond their ends

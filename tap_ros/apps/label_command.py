@@ -17,7 +17,7 @@ from tap_ros.base.options import File, Folder
 from tap_ros.base.text import listing
 from tap_ros.evaluation.intervals import share_interval
 from tap_ros.images.drawing import png_bytes
-from tap_ros.recording.bags import Paths
+from tap_ros.recording.bags import find_bags, Paths
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.events import Event, write_events
 from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
@@ -112,7 +112,8 @@ def run(options: Options) -> None:
 def describe_all(recordings: Paths, image_topics: Sequence[str],
                  signals: Sequence[str]) -> tuple[EpisodeStore, list[Film | None]]:
     """Return the demonstrations as the first camera saw them, and what is known of each."""
-    store, *beside = (open_recordings(recordings, reading=Reading(
+    bags = find_bags(recordings)
+    store, *beside = (open_recordings(bags, reading=Reading(
         image_topic=topic, crop='whole', size=SIZE)) for topic in image_topics or ('',))
     names = signals_like(store, signals)
     return store, [film_together(store, i, beside, names) for i in tqdm(

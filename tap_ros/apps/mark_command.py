@@ -63,30 +63,31 @@ class MarkServer(PageServer):
 
     def answer(self, path: str, sent: bytes | None) -> Answer:
         """Answer what the page asks for."""
-        marking, (what, *words) = self.marking, path.split('/')
-        if path == 'mark' and sent is not None:
+        marking, marked = self.marking, path == 'mark' and sent is not None
+        if marked:
             try:
-                asked = json.loads(sent)
+                asked = json.loads(sent or b'')
                 marking.mark(asked['episode'], asked['frames'])
             except StorageError as error:
                 return refused(HTTPStatus.INSUFFICIENT_STORAGE, str(error))
             except (LookupError, TypeError, ValueError, RecursionError, TapError) as error:
                 return refused(HTTPStatus.BAD_REQUEST, str(error))
-        elif path != 'state':
-            lengths = marking.store.lengths
-            numbers = [int(word) for word in words if word.isdecimal() and len(word) < 10]
-            if len(numbers) != len(words) or not numbers or numbers[0] >= len(lengths):
-                return super().answer(path, sent)
-            if what == 'about' and len(numbers) == 1:
-                return _json(marking.about(*numbers))
-            if what in ('frame', 'small') and len(numbers) == 2 and numbers[1] < lengths[
-                    numbers[0]]:
-                data = picture_bytes(self._full_size.picture(*numbers) if what == 'frame'
-                                     else marking.store.frames(numbers[0])[numbers[1]])
-                kind = 'png' if data.startswith(b'\x89PNG') else 'jpeg'
-                return HTTPStatus.OK, data, f'image/{kind}'
+        if marked or path == 'state':
+            return _json(marking.state() | {'commands': marking.commands(self._options)})
+        what, *words = path.split('/')
+        numbers = [int(word) for word in words if word.isdecimal() and len(word) < 10]
+        lengths = marking.store.lengths
+        if not numbers or len(numbers) != len(words) or numbers[0] >= len(lengths):
             return super().answer(path, sent)
-        return _json(marking.state() | {'commands': marking.commands(self._options)})
+        if what == 'about' and len(numbers) == 1:
+            return _json(marking.about(*numbers))
+        if what in ('frame', 'small') and len(numbers) == 2 and numbers[1] < lengths[numbers[0]]:
+            data = picture_bytes(self._full_size.picture(*numbers) if what == 'frame'
+                                 else marking.store.frames(numbers[0])[numbers[1]])
+            kind = 'png' if data.startswith(b'\x89PNG') else 'jpeg'
+            return HTTPStatus.OK, data, f'image/{kind}'
+        return super().answer(path, sent)
+
 
 def _json(content: object) -> Answer:
     return HTTPStatus.OK, json.dumps(content).encode(), 'application/json'

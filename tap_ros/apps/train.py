@@ -98,9 +98,10 @@ def _shape(asked: Config) -> dict[str, Any]:
 def _recipe_of(asked: Config, recipes: dict[str, Any]) -> str:
     """Name the recipe for recordings: that of the task of their first episode, if there is one."""
     with suppress(TapError):  # what cannot be read, the run says
-        from tap_ros.recording.cache import open_recordings  # --help does without numpy
+        from tap_ros.recording.bags import known_bags  # --help does without numpy
+        from tap_ros.recording.cache import open_recordings
         task = asked.recordings and open_recordings(
-            asked.recordings, reading=reading_of(asked), network='the network')[0].task
+            known_bags(asked.recordings), reading=reading_of(asked), network='the network')[0].task
         if task in recipes:
             return task
     return 'foreign' if getattr(asked, 'marks', '') else next(iter(recipes))

@@ -249,6 +249,14 @@ class LearnedForwardModel(nn.Module):
         cells = flow.flatten(2).scatter(2, window.expand(-1, 2, -1), moved.flatten(2))
         return cells.view_as(flow), following, masks
 
+    def rollout(self, features: torch.Tensor, gripper: torch.Tensor,
+                actions: torch.Tensor) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Yield flow and masks, see advance, after each of actions (N, T, 4) from (N, 4)."""
+        flow = self.still(len(actions))
+        for action in actions.unbind(1):
+            flow, gripper, masks = self.advance(features, flow, gripper, action)
+            yield flow, masks
+
     def _window(self, gripper: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the cells (N, 1, m m) near the gripper, row-major, and points (N, 2, m, m)."""
         n, m = self.config.table_cells, self.config.window_cells

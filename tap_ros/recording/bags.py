@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find recordings at a path; say what it holds instead, and the command that helps."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import lru_cache
 from itertools import islice, product
 import os
 from pathlib import Path
@@ -17,8 +18,9 @@ from tap_ros.base.errors import ConfigError, RecordingError, RecordingWarning
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import CENTRE, TrainedCrop
 from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number, natural
+from tap_ros.recording.raw_files import beginning, stats_of
 from tap_ros.recording.reading import Reading
-from tap_ros.recording.sqlite_file import beginning, SQLITE
+from tap_ros.recording.sqlite_file import SQLITE
 from tap_ros.recording.topic_choice import Bag, list_paths, total
 
 VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
@@ -44,6 +46,21 @@ def find_bags(paths: Paths) -> list[Bag]:
     for path in [paths] if isinstance(paths, (str, os.PathLike, Bag)) else paths:
         bags += [path] if isinstance(path, Bag) else map(Bag, _find(Path(path)))
     return bags
+
+
+def known_bags(paths: Paths) -> list[Bag]:
+    """
+    Find recordings as find_bags does; one that was found before is the same Bag, opened once.
+
+    :raises RecordingError: likewise.
+    """
+    return [_known(bag.files, tuple(map(stats_of, bag.files))) for bag in find_bags(paths)]
+
+
+@lru_cache(1000)
+def _known(files: Sequence[Path], stats: tuple[object, ...]) -> Bag:
+    """Return a Bag, another one when a file of it has changed."""
+    return Bag(files)
 
 
 def _find(path: Path) -> list[list[Path]]:

@@ -8,7 +8,7 @@ its pictures as uint8 arrays, and all else as columns. Any number of processes m
 it at once.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
@@ -22,7 +22,6 @@ import os
 from pathlib import Path
 import shutil
 import tempfile
-import time
 from typing import Any
 import warnings
 
@@ -43,16 +42,14 @@ from tap_ros.recording.align import assemble, runs_of
 from tap_ros.recording.bags import find_bags, Paths
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
 from tap_ros.recording.episode import Episode, EpisodeTable
-from tap_ros.recording.mcap_file import bytes_of, McapFile
+from tap_ros.recording.known import cache_folder, digest_of, ENVIRONMENT, FORMAT, remembered
+from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.metadata import ArmMount, read_mount
-from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
+from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.topic_choice import Bag, list_paths
 from tqdm import tqdm
 
-FORMAT = 10  # of a cache folder; another number makes all files be decoded again
-ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
-_SETTLED_NS = 2 * 10**9  # a file changed later may change again and show the same time
 
 
 class EpisodeStore:
@@ -61,7 +58,7 @@ class EpisodeStore:
 
     :param tables: list of EpisodeTable.
     :param file_hashes: hex digests of the files, in order, and what else tells them apart.
-    :param sources: of each table, the first file of its bag.
+    :param bags: that of each table.
     :ivar image_size: (height, width) of the frames.
     :ivar camera_size: likewise, as they were recorded; None where that differs.
     :ivar cameras: topics of the cameras, sorted.
@@ -69,10 +66,9 @@ class EpisodeStore:
     """
 
     def __init__(self, tables: Sequence[EpisodeTable], file_hashes: Iterable[str],
-                 sources: Sequence[Path]) -> None:
+                 bags: Sequence[Bag]) -> None:
         self._index = [(table, i) for table in tables for i in range(len(table))]
-        self._sources = [source for table, source in zip(tables, sources, strict=True)
-                         for _ in range(len(table))]
+        self._bags = [bag for table, bag in zip(tables, bags, strict=True) for _ in table.spans]
         lengths = [np.diff(table.starts) for table in tables]
         self.lengths = np.concatenate([np.empty(0, np.int64), *lengths])  # (E,) frames
         self.num_frames = int(self.lengths.sum())
@@ -97,9 +93,13 @@ class EpisodeStore:
         """Yield the episodes."""
         return (self[i] for i in range(len(self)))
 
+    def bag(self, i: int) -> Bag:
+        """Return the bag that episode i is in."""
+        return self._bags[i]
+
     def source(self, i: int) -> Path:
         """Return the first file of the bag that episode i is in."""
-        return self._sources[i]
+        return self._bags[i].files[0]
 
     def frames(self, i: int) -> np.ndarray:
         """Return the frames of episode i, (T, H, W, 3) uint8."""
@@ -157,10 +157,10 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     # What each file is, and which topics are read: known from before, or found out.
     files = list(dict.fromkeys(chain.from_iterable(bag.files for bag in bags)))
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        digests = dict(zip(files, pool.map(partial(_digest, cache), files)))
+        digests = dict(zip(files, pool.map(partial(digest_of, cache), files)))
     choices = [
-        _remembered(cache, ['topics', camera, *map(digests.__getitem__, bag.files)],
-                    lambda: asdict(bag.choose(camera)))  # noqa: B023  it is called at once
+        remembered(cache, ['topics', camera, *map(digests.__getitem__, bag.files)],
+                   lambda: asdict(bag.choose(camera)))  # noqa: B023  it is called at once
         for bag, camera in zip(bags, cameras)]
     for bag, choice in zip(bags, choices):
         for doubt in choice['doubts']:
@@ -178,8 +178,8 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     _check_sizes(list(chain(*columns)))
     # Episodes of the files that follow each other.
     arms = [read_mount(bag.files[0].parent) for bag in bags]
-    cutting = for_bags(reading, len(found))
-    runs = [(assemble(run, arm, cutting), bag.files[0])
+    cutting = reading if len(found) == 1 else replace(reading, episode_seconds=0)
+    runs = [(assemble(run, arm, cutting), bag)
             for parts, arm, bag in zip(columns, arms, bags) for run in runs_of(parts)]
     apart: list[Any] = [asdict(arm) for arm in arms if arm != ArmMount()]
     if len(reading.cameras) > 1:
@@ -189,50 +189,10 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     store = EpisodeStore(
         [table for table, _ in runs],
         [*(digests[path] for bag in bags for path in bag.files), *map(json.dumps, apart)],
-        [source for _, source in runs])
+        [bag for _, bag in runs])
     if not len(store):
         raise RecordingError(f'{found[0].source}: no camera image lies within an episode')
     return store
-
-
-def cache_folder() -> Path:
-    """Return the folder of the cache: $TAP_ROS_CACHE or ~/.cache/tap_ros."""
-    return Path(os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
-
-
-def _digest(cache: Path, path: Path) -> str:
-    """Return the SHA-256 of a file; of one that was read before and not changed since, as then."""
-    if not path.is_file():
-        bytes_of(path)  # says why it cannot be read
-    parts = [path, *filter(Path.is_file, [path.with_name(f'{path.name}-wal')])]  # of sqlite
-
-    def read() -> str:
-        with open(path, 'rb') as stream:
-            digest = hashlib.file_digest(stream, 'sha256')
-        for log in parts[1:]:
-            digest.update(log.read_bytes())
-        return digest.hexdigest()
-
-    try:
-        stats = [(one.st_size, one.st_ino, one.st_mtime_ns, one.st_ctime_ns)
-                 for one in map(os.stat, parts)]
-        if time.time_ns() - max(max(one[2:]) for one in stats) < _SETTLED_NS:
-            return read()
-        return str(_remembered(cache, ['file', str(path.resolve()), stats], read))
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
-
-
-def _remembered(cache: Path, key: list[Any], find: Callable[[], Any]) -> Any:
-    """Return what was found before by a key; else find and keep it. JSON holds both."""
-    path = cache / 'known' / hashlib.sha256(json.dumps([FORMAT, *key]).encode()).hexdigest()
-    with suppress(OSError, ValueError):
-        return json.loads(path.read_text())
-    value = find()
-    with suppress(OSError):  # who decodes into the cache says so
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(value))
-    return value
 
 
 def _check_first_sizes(sizes: set[tuple[int, ...]], reading: Reading, network: str) -> None:

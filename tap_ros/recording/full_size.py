@@ -3,8 +3,6 @@
 """Pictures of episodes as they were recorded, for people: read one by one, kept nowhere."""
 
 from contextlib import suppress
-from functools import lru_cache
-from pathlib import Path
 import threading
 
 import numpy as np
@@ -15,9 +13,6 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.messages import decode
-from tap_ros.recording.sqlite_file import open_file
-
-_MOST_OPEN = 4  # files; one that was packed as a whole stands in memory
 
 
 class FullSize:
@@ -31,7 +26,7 @@ class FullSize:
     def __init__(self, store: EpisodeStore, part: str = '') -> None:
         self._store, self._crop = store, Crop(part)
         self._lock = threading.Lock()
-        self._file = lru_cache(_MOST_OPEN)(open_file)
+        self._newest: McapFile | None = None  # read; one that was packed as a whole is in memory
 
     def picture(self, i: int, t: int) -> np.ndarray:
         """
@@ -41,13 +36,14 @@ class FullSize:
         """
         path, topic, log, stamp = self._store.recorded(i, t)
         with suppress(TapError, OSError):
-            for kind, data in self._messages(path, topic, log):
+            with self._lock:
+                file = self._store.bag(i).file(path)
+                if self._newest not in (None, file):
+                    self._newest.close()
+                self._newest = file
+                messages = file.at(topic, log)
+            for kind, data in messages:
                 message = decode(kind, data)
                 if to_nanoseconds(message.header.stamp) == stamp:
                     return self._crop.image(decode_image(message))
         return self._store.frames(i)[t]
-
-    def _messages(self, path: Path, topic: str, log: int) -> list[tuple[str, memoryview]]:
-        with self._lock:
-            file: McapFile = self._file(path)
-            return file.at(topic, log)

@@ -16,9 +16,7 @@ from functools import cached_property
 from io import BytesIO
 from itertools import chain
 import mmap
-import os
 from pathlib import Path
-import stat
 import struct
 from typing import Any
 import zlib
@@ -35,6 +33,7 @@ from tap_ros.base.contract import MAX_PICTURE_BYTES
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.text import escaped
 from tap_ros.recording.defects import Defect, FAR
+from tap_ros.recording.raw_files import bytes_of
 from tap_ros.recording.trust import Budget
 import zstandard
 
@@ -338,37 +337,3 @@ def _split(data: bytes | memoryview, budget: Budget) -> Iterator[McapRecord | Fo
         elif kind in (Opcode.SCHEMA, Opcode.CHANNEL):
             yield (Schema if kind == Opcode.SCHEMA else ChannelRecord).read(
                 ReadDataStream(BytesIO(view[start:at])))
-
-
-def bytes_of(path: str | Path) -> bytes | mmap.mmap:
-    """
-    Map a file into memory; one that was packed as a whole is unpacked there.
-
-    :raises RecordingError: when it is missing, empty, no regular file, or does not unpack.
-    """
-    try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a FIFO would wait for its writer
-            raise RecordingError(f'{path}: not a regular file; expected an .mcap file')
-        with open(path, 'rb') as stream:
-            start = stream.read(4)
-            if start == zstandard.FRAME_HEADER:
-                stream.seek(0)
-                pieces, budget = [], Budget(os.fstat(stream.fileno()).st_size)
-                reader = zstandard.ZstdDecompressor().stream_reader(
-                    stream, read_across_frames=True)
-                while piece := reader.read(2**20):
-                    budget.take(len(piece))
-                    pieces.append(piece)
-                data = b''.join(pieces)
-                if not data:
-                    raise RecordingError(f'{path}: does not unpack: it is cut short')
-            elif start:
-                data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
-    except (ValueError, zstandard.ZstdError, MemoryError) as error:
-        raise RecordingError(f'{escaped(path)}: does not unpack: {escaped(error)}; unpack it with '
-                             'zstd -d') from error
-    if not start:
-        raise RecordingError(f'{path}: the file is empty; it holds no message')
-    return data

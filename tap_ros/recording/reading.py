@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How recordings are read: which pictures of which camera, and where episodes are cut."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, TYPE_CHECKING
 
@@ -78,11 +78,6 @@ class ReadingOptions(Reading):
 
     def __post_init__(self) -> None:
         """Leave it to Reading, which is made of this, to refuse what cannot be read with."""
-
-
-def for_bags(reading: Reading, count: int) -> Reading:
-    """Return how each of so many bags is read: only one alone is cut by length."""
-    return reading if count == 1 else replace(reading, episode_seconds=0)
 
 
 def reading_of(settings: Reading) -> Reading:

@@ -14,9 +14,9 @@ from mcap.summary import Summary
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.text import escaped
 from tap_ros.recording.defects import Defect, FAR
-from tap_ros.recording.mcap_file import bytes_of, Channel, Found, McapFile
+from tap_ros.recording.mcap_file import Channel, Found, McapFile
 from tap_ros.recording.metadata import PACKED
-import zstandard
+from tap_ros.recording.raw_files import beginning, bytes_of
 
 SQLITE = b'SQLite format 3\0'
 
@@ -103,18 +103,3 @@ def open_file(path: Path) -> McapFile:
     :raises RecordingError: as McapFile.
     """
     return (SqliteFile if beginning(path).startswith(SQLITE) else McapFile)(path)
-
-
-def beginning(path: Path) -> bytes:
-    """Return how a file begins, unpacked; nothing of what is no file."""
-    try:
-        if path.is_file():  # opening a FIFO would wait for its writer
-            with open(path, 'rb') as stream:
-                start = stream.read(32)
-                if not start.startswith(zstandard.FRAME_HEADER):
-                    return start
-                stream.seek(0)
-                return zstandard.ZstdDecompressor().stream_reader(stream).read(32)
-    except (OSError, zstandard.ZstdError):
-        pass  # who reads it says why
-    return b''

@@ -75,6 +75,7 @@ class Bag:
 
     def __init__(self, files: Sequence[Path]) -> None:
         self.files, self.source = tuple(files), list_paths(files)
+        self._opened: dict[Path, McapFile] = {}
 
     def choose(self, image_topic: str = '') -> Choice:
         """
@@ -112,14 +113,20 @@ class Bag:
             file.close()
         return choice
 
-    @cached_property
-    def opened(self) -> list[McapFile]:
+    def file(self, path: Path) -> McapFile:
         """
-        The files.
+        Return one of the files, opened.
 
-        :raises RecordingError: for one of which nothing can be read.
+        :raises RecordingError: when nothing of it can be read.
         """
-        return list(map(open_file, self.files))
+        if path not in self._opened:
+            self._opened[path] = open_file(path)
+        return self._opened[path]
+
+    @property
+    def opened(self) -> list[McapFile]:
+        """All files; raises as `file`."""
+        return list(map(self.file, self.files))
 
     @cached_property
     def _every(self) -> list[Channel]:

@@ -50,29 +50,27 @@ class FileWriter:
     :param path: of the file; must not exist.
     :param name: of the file in its bag; by default the file's own.
     :param compression: 'zstd', 'lz4' or 'none', of the chunks.
-    :param chunk_bytes: size at which a chunk is finished.
     :raises RecordingError: for an unknown compression, and a file that exists.
     """
 
-    def __init__(self, path: str | Path, name: str | None = None, compression: str = 'zstd',
-                 chunk_bytes: int = CHUNK_BYTES) -> None:
+    def __init__(self, path: str | Path, name: str = '', compression: str = 'zstd') -> None:
         if compression not in _COMPRESSIONS:
             raise RecordingError(
                 f'compression: expected zstd, lz4 or none, got {compression!r}')
         self.path = Path(path)
-        self._name = name or self.path.name
         try:
             self._stream = open(self.path, 'xb')
         except OSError as error:
             raise RecordingError(f'{self.path}: cannot be created: {error.strerror}') from error
         self._writer = Writer(
-            self._stream, chunk_size=chunk_bytes, compression=_COMPRESSIONS[compression],
+            self._stream, chunk_size=CHUNK_BYTES, compression=_COMPRESSIONS[compression],
             index_types=IndexType.ALL)
         self._writer.start(profile='ros2', library=LIBRARY)
         self._schemas: dict[str, int] = {}  # type -> id
         self._channels: dict[str, int] = {}  # topic -> id
         self._info: dict[str, Any] = {
-            'path': self._name, 'start': 0, 'end': 0, 'message_count': 0, 'topics': {}}
+            'path': name or self.path.name, 'start': 0, 'end': 0, 'message_count': 0,
+            'topics': {}}
 
     def write_raw(self, topic: str, type_name: str, data: bytes, log_time_ns: int,
                   publish_time_ns: int | None = None, qos: topics.Qos | None = None) -> None:
@@ -100,8 +98,8 @@ class FileWriter:
             self._writer.add_message(channel, int(log_time_ns), data, int(publish), info['count'])
         info['count'] += 1
         total = self._info
-        first = total['message_count'] == 0
-        total['start'] = log_time_ns if first else min(total['start'], log_time_ns)
+        if not total['message_count'] or log_time_ns < total['start']:
+            total['start'] = log_time_ns
         total['end'] = max(total['end'], log_time_ns)
         total['message_count'] += 1
 
@@ -227,7 +225,6 @@ class EpisodeWriter:
 
     def __init__(self, path: str | Path, compression: str = 'zstd',
                  camera_matrix: ArrayLike | None = None, jpeg: bool = False) -> None:
-        self.path = Path(path)
         self._jpeg = jpeg
         self.path, self._stack = Path(path), ExitStack()
         self._file = self._stack.enter_context(new_file(self.path, compression))
@@ -250,17 +247,16 @@ class EpisodeWriter:
         :raises RecordingError: when a field has the wrong type, shape or order.
         """
         check_episode(episode)
-        shift = 0
-        if self._last_log is not None and episode.stamps[0] <= self._last_log:
-            shift = self._last_log + EPISODE_GAP_NS - int(episode.stamps[0])
-        self._shift = shift
         first, last = int(episode.stamps[0]), int(episode.stamps[-1])
+        self._shift = 0
+        if self._last_log is not None and first <= self._last_log:
+            self._shift = self._last_log + EPISODE_GAP_NS - first
         self._mark(episode, first, event=0)
         self._goal(episode, first)
         for t, stamp in enumerate(episode.stamps.tolist()):
             self._step(episode, t, stamp)
         self._mark(episode, last, event=1)
-        self._last_log = last + shift
+        self._last_log = last + self._shift
 
     def _step(self, episode: Episode, t: int, stamp: int) -> None:
         """Write all messages of one time step."""
@@ -338,8 +334,8 @@ def count_episodes(path: Path) -> int:
 
     :raises RecordingError: when the file is not finished.
     """
-    marks = _describe(path)['topics'].get(topics.EPISODE.recorded, {'count': 0})
-    return marks['count'] // 2
+    marks = _describe(path)['topics'].get(topics.EPISODE.recorded)
+    return marks['count'] // 2 if marks else 0
 
 
 def _describe(path: Path) -> dict[str, Any]:

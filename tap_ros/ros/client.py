@@ -29,6 +29,7 @@ from tap_ros.base.text import escaped, listing
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.ros.calls import call, CallError, Spinner
 from tap_ros.ros.heartbeat import Liveness
+from tap_ros.ros.observations import Observations
 from tap_ros.ros.reaching import CANCEL, CLIENT, Goals, Reaching
 from tap_ros.ros.requests import (
     by_name,
@@ -41,7 +42,7 @@ from tap_ros.ros.requests import (
 )
 from tap_ros.ros.run import configure_fast_dds
 from tap_ros.ros.topics import SERVICE_QOS, to_stamp
-from tap_ros.ros.views import View, Views
+from tap_ros.ros.views import observe, View, wait_for_view
 
 SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offers it
     'predict': (PredictSubgoal, 'predict_subgoal', 'predictor_node'),
@@ -96,7 +97,6 @@ class Client:
         self.node = node
         self._group = ReentrantCallbackGroup()
         self.answers = self._group if self._context is None else self._spinner.answers
-        self._views = Views(node, self._group)
         self._lock = threading.RLock()
         self._made: dict[str, Any] = {}  # what was asked for so far
         atexit.register(self.close)  # a goal has an owner, and threads end before Python does
@@ -255,7 +255,7 @@ class Client:
         left = _countdown('reset', self.timeout_s)
         scene: dict[str, Any] = {'task': task, 'seed': seed, 'hide_arm': hide_arm}
         make_request(ResetScene.Request, scene)  # raises before anything is waited for
-        self._views.subscribe('goal')  # before something comes
+        self._observed('goal')  # before something comes
         before = self.camera(objects=objects, timeout_s=left()).stamp_ns
         self.call('reset', left(), **scene)
         goal = self.goal(before, objects, left())
@@ -295,12 +295,14 @@ class Client:
         :param objects: wait for one with the objects in it.
         :raises CallError: naming the silent topic.
         """
-        return self._views.wait('camera', after_ns, objects, self._timeout(timeout_s))
+        return wait_for_view(
+            self._observed('camera'), 'camera', after_ns, objects, self._timeout(timeout_s))
 
     def goal(self, after_ns: int = -1, objects: bool = True,
              timeout_s: float | None = None) -> View:
         """Return the newest goal picture, as camera does."""
-        return self._views.wait('goal', after_ns, objects, self._timeout(timeout_s))
+        return wait_for_view(
+            self._observed('goal'), 'goal', after_ns, objects, self._timeout(timeout_s))
 
     def _once(self, name: str, make: Callable[[], Any]) -> Any:
         with self._lock:
@@ -322,6 +324,9 @@ class Client:
         """What sends goals."""
         return self._once('goals', lambda: Goals(
             self.node, self._liveness(PLANNER), self._group, self.answers))
+
+    def _observed(self, name: str) -> Observations:
+        return self._once(name, lambda: observe(self.node, name, self._group))
 
     def _liveness(self, name: str) -> Liveness:
         return self._once(name, lambda: Liveness(self.node, name, self._group))

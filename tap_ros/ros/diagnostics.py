@@ -141,16 +141,14 @@ class Diagnostics:
                 + (f': {why}' if why else ', though it is published'))
         self._told = silent
 
-    def _describe_work(self, values: Mapping[str, Any], now: float,
-                       idle: str) -> DiagnosticStatus:
+    def _describe_work(self, values: dict[str, Any], now: float, idle: str) -> DiagnosticStatus:
         for what, work in self._work.items():
             times = work.recent(now, WORK_SECONDS)[:, 1]
             p50, p99 = np.percentile(times, (50, 99)) if len(times) else (math.nan, math.nan)
-            values = {**values, f'{what} calls': work.count,
-                      f'{what} p50_ms': f'{p50:.2f}', f'{what} p99_ms': f'{p99:.2f}'}
-        values, level, text = {**values, 'errors': self._errors}, DiagnosticStatus.OK, 'OK'
-        if idle:
-            level, text = DiagnosticStatus.WARN, idle
+            values |= {f'{what} calls': work.count,
+                       f'{what} p50_ms': f'{p50:.2f}', f'{what} p99_ms': f'{p99:.2f}'}
+        level, text = (DiagnosticStatus.WARN, idle) if idle else (DiagnosticStatus.OK, 'OK')
+        values['errors'] = self._errors
         if self._errors:
             age = now - self._error_time
             values |= {'last_error': self._last_error, 'last_error_age_s': f'{age:.1f}'}

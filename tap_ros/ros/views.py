@@ -3,7 +3,6 @@
 """What a Client sees: the newest pictures of the camera and of the goal, and their objects."""
 
 from dataclasses import dataclass
-import threading
 
 import numpy as np
 from rclpy.callback_groups import CallbackGroup
@@ -39,44 +38,33 @@ class View:
     stamp_ns: int
 
 
-class Views:
+def observe(node: Node, name: str, group: CallbackGroup) -> Observations:
+    """Return what comes from now on of 'camera' or 'goal', while another thread spins the node."""
+    latched = name == 'goal'
+    views = Observations(*TOPICS[name], latched=latched)
+    views.subscribe(node, TOPICS[name], LATCHED if latched else STREAM, group)
+    return views
+
+
+def wait_for_view(views: Observations, name: str, after_ns: int, objects: bool,
+                  timeout_s: float) -> View:
     """
-    The newest views of 'camera' and 'goal', subscribed to when they are first asked for.
+    Return the newest view.
 
-    :param node: rclpy Node that another thread spins.
+    :param views: as observe returns for this name.
+    :param after_ns: wait for one that is stamped later than this.
+    :param objects: wait for one with the objects in it.
+    :raises CallError: naming the silent topic.
     """
-
-    def __init__(self, node: Node, group: CallbackGroup) -> None:
-        self._node, self._group, self._lock = node, group, threading.Lock()
-        self._views: dict[str, Observations] = {}
-
-    def subscribe(self, name: str) -> Observations:
-        """Return the Observations of one of them."""
-        with self._lock:
-            if name not in self._views:
-                views = self._views[name] = Observations(*TOPICS[name], latched=name == 'goal')
-                views.subscribe(self._node, TOPICS[name], LATCHED if name == 'goal' else STREAM,
-                                self._group)
-            return self._views[name]
-
-    def wait(self, name: str, after_ns: int, objects: bool, timeout_s: float) -> View:
-        """
-        Return the newest view.
-
-        :param after_ns: wait for one that is stamped later than this.
-        :param objects: wait for one with the objects in it.
-        :raises CallError: naming the silent topic.
-        """
-        views, topics = self.subscribe(name), TOPICS[name]
-        found = views.wait(('image', 'objects') if objects else ('image',), timeout_s, after_ns)
-        if found is None:
-            silent = 'objects' if views.newest('image', after_ns=after_ns) else 'image'
-            raise CallError(f'{views.names([silent], explained=True)}: '
-                            f'nothing new came within {timeout_s:g} s')
-        listed = found.messages.get('objects', ObjectStates())
-        return View(decode_image(found.messages['image'], topics['image'][1]),
-                    *decode_objects(listed, topics['objects'][1]), positions_of(listed),
-                    found.stamp_ns)
+    found = views.wait(('image', 'objects') if objects else ('image',), timeout_s, after_ns)
+    if found is None:
+        silent = 'objects' if views.newest('image', after_ns=after_ns) else 'image'
+        raise CallError(f'{views.names([silent], explained=True)}: '
+                        f'nothing new came within {timeout_s:g} s')
+    listed, topics = found.messages.get('objects', ObjectStates()), TOPICS[name]
+    return View(decode_image(found.messages['image'], topics['image'][1]),
+                *decode_objects(listed, topics['objects'][1]), positions_of(listed),
+                found.stamp_ns)
 
 
 def positions_of(message: ObjectStates) -> np.ndarray:

@@ -19,7 +19,7 @@ from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.registration import locate, mean_shift, register
-from tap_ros.tracking.silhouette import clicked, middle, RADIUS, silhouette, top_face
+from tap_ros.tracking.silhouette import centre, clicked, RADIUS, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
@@ -80,11 +80,11 @@ class RigidTracker:
         for k, click in enumerate(clicks):
             name = 'click ' + str(tuple(round(float(x), 1) for x in plane.enlarge(click)))
             mask = clicked(picture, click, np.delete(clicks, k, 0), name)
-            place = middle(mask, plane) if self._snap else plane.of_middle(click)
+            face = top_face(mask, plane)
+            place = plane.of_top(centre(face)) if self._snap else plane.of_middle(click)
             if plane.calibrated and not (np.abs(place) < EDGE).all():
                 raise TrackingError(f'{name} is on nothing within {EDGE:g} m of the middle of the '
                                     'table, along x and y; click on an object')
-            face = top_face(mask, plane)
             objects.append(_Object(
                 place, [Template(picture, plane, mask, place)],
                 Template(picture, plane, mask, place, face=face)))

@@ -134,11 +134,6 @@ def top_face(mask: np.ndarray, plane: Plane) -> np.ndarray:
     return top if top.sum() > FLAT * mask.sum() else mask
 
 
-def middle(mask: np.ndarray, plane: Plane) -> np.ndarray:
-    """Return the place (2,) of an object by its silhouette (h, w)."""
-    return plane.of_top(centre(top_face(mask, plane)))
-
-
 def centre(mask: np.ndarray) -> np.ndarray:
     """Return the mean pixel (2,) of a mask (h, w)."""
     return np.argwhere(mask)[:, ::-1].mean(0)

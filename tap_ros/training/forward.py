@@ -152,9 +152,8 @@ def sample_grid(model: LearnedForwardModel, store: Episodes,
     scene = model.look(batch.images[:, 0], model.draw_arm(batch.grippers[:, 0])[:, 3:])
     columns = [list(to_uint8(batch.images[:, 0])), grey_panels(scene.objects[:, 3].cpu()),
                list(to_uint8(scene.background))]
-    flow, gripper = model.still(_SHOWN), batch.grippers[:, 0]
-    for t in range(1, HORIZON + 1):
-        flow, gripper, _ = model.advance(scene.features, flow, gripper, batch.actions[:, t - 1])
+    steps = model.rollout(scene.features, batch.grippers[:, 0], batch.actions)
+    for t, (flow, _) in enumerate(steps, start=1):
         if t in (HORIZON // 3, 2 * HORIZON // 3, HORIZON):
             predicted, _ = model.picture(scene, flow, model.draw_arm(batch.grippers[:, t]))
             columns += [list(to_uint8(batch.images[:, t])), list(to_uint8(predicted))]

@@ -166,12 +166,9 @@ def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Coll
     arms = draw_arm_like(model, batch, 0)
     first = batch.images[:, 0]
     scene = model.look(first, arms[:, 3:].detach(), batch.homography)
-    flow, gripper = model.still(len(first)), batch.grippers[:, 0]
     pictures = moving = first.new_zeros(())
-    count = batch.actions.shape[1]
-    for t in range(1, count + 1):
-        action = batch.actions[:, t - 1]
-        flow, gripper, masks = model.advance(scene.features, flow, gripper, action)
+    steps = model.rollout(scene.features, batch.grippers[:, 0], batch.actions)
+    for t, (flow, masks) in enumerate(steps, start=1):
         moving = moving + (1 - masks[:, 2]).mean()
         if t in picture_steps:
             arm = draw_arm_like(model, batch, t)
@@ -181,7 +178,7 @@ def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Coll
             weight = torch.maximum(*(motion_weight(picture, first)
                                      for picture in (target, predicted.detach())))
             pictures = pictures + picture_loss(predicted, target, weight)
-    parts = {'picture': pictures / len(picture_steps), 'moving': moving / count,
+    parts = {'picture': pictures / len(picture_steps), 'moving': moving / batch.actions.shape[1],
              'objects': scene.objects[:, 3].mean()}
     loss = (parts['picture'] + STILL_WEIGHT * parts['moving']
             + OBJECT_WEIGHT * parts['objects'])

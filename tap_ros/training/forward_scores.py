@@ -108,11 +108,9 @@ def measure_pictures(model: LearnedForwardModel, store: 'Episodes',
             store, Cuts([i] * count, starts, steps[-1]), model.homography.cpu(),
             model.config.robot_mask).to(model.homography.device)
         first, gripper = windows.images[:, 0], windows.grippers[:, 0]
-        scene, flow = model.look(first, model.draw_arm(gripper)[:, 3:]), model.still(count)
-        rows = []
-        for t in range(1, steps[-1] + 1):
-            flow, gripper, _ = model.advance(
-                scene.features, flow, gripper, windows.actions[:, t - 1])
+        scene, rows = model.look(first, model.draw_arm(gripper)[:, 3:]), []
+        ahead = model.rollout(scene.features, gripper, windows.actions)
+        for t, (flow, _) in enumerate(ahead, start=1):
             if t in steps:
                 seen = windows.images[:, t]
                 counts = ~windows.hidden[:, t, 0]

@@ -19,7 +19,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
-from tap_ros.recording.bags import find_bags
+from tap_ros.recording.bags import known_bags
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.recording.reading import reading_of
@@ -228,9 +228,9 @@ class Run(Generic[Config]):
 
 def bags_of(config: RunConfig) -> list[Bag]:
     """Return the recordings, and of those held out what is not among them."""
-    bags = find_bags(config.recordings)
+    bags = known_bags(config.recordings)
     known = {file.resolve() for bag in bags for file in bag.files}
-    return bags + [bag for bag in find_bags([parse_held_out(one)[0] for one in config.held_out])
+    return bags + [bag for bag in known_bags([parse_held_out(one)[0] for one in config.held_out])
                    if not {file.resolve() for file in bag.files} <= known]
 
 

@@ -147,7 +147,9 @@ def test_a_recording_that_is_gone_is_shown_as_small_as_it_is_kept(bag, tmp_path)
     assert pictures.picture(0, 1).shape == (HIGH, WIDE, 3)
     file, = copy.glob('*.mcap')
     file.write_bytes(file.read_bytes()[:-20])  # as of a recorder that was killed: no index
+    store = open_recordings([copy], progress=False, reading=Reading(crop='whole', size=64))
     assert FullSize(store).picture(0, 1).shape == (64, 64, 3)
+    store = open_recordings([copy], progress=False, reading=Reading(crop='whole', size=64))
     file.unlink()
     assert FullSize(store).picture(0, 1).shape == (64, 64, 3)
 

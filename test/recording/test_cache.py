@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording import cache as cache_module
+from tap_ros.recording import known
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.reading import Reading
@@ -43,7 +44,7 @@ def test_the_key_is_the_content_of_the_file(bag, episodes, cache, monkeypatch):
 
 def test_a_file_is_opened_and_hashed_once_and_again_when_it_has_changed(
         bag, episodes, monkeypatch):
-    monkeypatch.setattr(cache_module, '_SETTLED_NS', 0)  # files made just now count as old ones
+    monkeypatch.setattr(known, '_SETTLED_NS', 0)  # files made just now count as old ones
     done = Counter()
 
     def counted(name, function):

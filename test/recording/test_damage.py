@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Damaged files: what is whole is read, what is not is named, nothing is altered or joined."""
 
-from functools import partial
 import random
 import re
 import struct
@@ -17,7 +16,7 @@ from tap_ros.base.errors import RecordingError, RecordingWarning
 from tap_ros.recording import mcap_file
 from tap_ros.recording import writer as writer_module
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.writer import EpisodeWriter, FileWriter
+from tap_ros.recording.writer import EpisodeWriter
 import zstandard
 
 IMAGE = 'sensor_msgs/msg/Image'
@@ -27,7 +26,7 @@ CHUNK, MESSAGE_INDEX, DATA_END = 6, 7, 15
 @pytest.fixture
 def chunked(tmp_path, monkeypatch):
     """Write episodes into a file of many chunks, most of which span several."""
-    monkeypatch.setattr(writer_module, 'FileWriter', partial(FileWriter, chunk_bytes=3000))
+    monkeypatch.setattr(writer_module, 'CHUNK_BYTES', 3000)
     episodes = [make_episode(i, T=4 + i % 3, start=(i + 1) * 10**10) for i in range(9)]
     with EpisodeWriter(tmp_path / 'a.mcap') as writer:
         for episode in episodes:

@@ -77,12 +77,11 @@ def test_without_pyav_the_most_frequent_cause_is_named_first_with_its_count(
 
 
 def test_frames_are_taken_at_a_rate(tmp_path, capsys):
-    found = []
-    assert list(at_rate([(t / 30, t) for t in range(31)], 10, found)) == list(range(0, 31, 3))
-    assert found == [t / 30 for t in range(0, 31, 3)]
-    assert list(at_rate([(t / 30, t) for t in range(31)], 4, [])) == [0, 8, 15, 23, 30]
+    frames = [(t / 30, t) for t in range(31)]
+    assert list(at_rate(frames, 10)) == frames[::3]
+    assert [t for _, t in at_rate(frames, 4)] == [0, 8, 15, 23, 30]
     for rate in (0, 30, 100):
-        assert list(at_rate([(t / 30, t) for t in range(31)], rate, [])) == list(range(31))
+        assert list(at_rate(frames, rate)) == frames
     shades = np.arange(0, 200, 20, np.uint8)
     write_video(tmp_path / 'a.mp4', np.broadcast_to(
         shades[:, None, None, None], (10, 48, 64, 3)), 10)

@@ -2,15 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of marks: their file, and what is learned from them and trained with it."""
 
+from collections import Counter
 from dataclasses import replace
+import hashlib
 import json
 
-from made_episodes import make_episode, write_bag
+from made_episodes import make_episode, move_squares, write_bag
 import numpy as np
 import pytest
+from tap_ros.apps.cli import main
 from tap_ros.base.errors import ConfigError
+from tap_ros.recording import known
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks, write_marks
+from tap_ros.recording.mcap_file import McapFile
 from tap_ros.training.marks import episode_preferences, LEAST, LIKELIEST
 from tap_ros.training.predictor import train
 from tap_ros.training.predictor_config import TrainingConfig
@@ -123,3 +128,33 @@ def test_the_likeliest_frames_are_those_about_the_label(bag, store, marks, tmp_p
     for one, other in zip(back, ahead):
         np.testing.assert_array_equal(one, other[::-1])
     assert back[0].argmax(1).tolist() == [3, 1]
+
+
+@pytest.mark.slow
+def test_a_training_opens_and_hashes_each_file_once(tmp_path, monkeypatch):
+    # The labels need the whole pictures, the training their middle, the keyframes full ones.
+    rng = np.random.default_rng(0)
+    whole = [move_squares(rng.uniform(20, 40, (2, 2)), rng.uniform(40, 60, (2, 2)), 9, 96, 8, i)
+             for i in range(27)]
+    bag = write_bag(tmp_path / 'wide', (
+        replace(one, frames=np.ascontiguousarray(one.frames[:, :72]), goal_frame=None, task='')
+        for one in whole))
+    path = tmp_path / 'wide.marks.json'
+    write_marks(path, open_recordings([bag], tmp_path / 'other', progress=False), [bag], {
+        i: [(4, 4)] for i in range(10)})
+    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
+    monkeypatch.setattr(known, '_SETTLED_NS', 0)  # files made just now count as old ones
+    done = Counter()
+
+    def counted(what, function):
+        def call(*args):
+            done[what, str(getattr(args[0], 'name', args[-1]))] += 1
+            return function(*args)
+        return call
+    monkeypatch.setattr(McapFile, '__init__', counted('opened', McapFile.__init__))
+    monkeypatch.setattr(hashlib, 'file_digest', counted('hashed', hashlib.file_digest))
+    assert main(['train', 'predictor', str(bag), '--marks', str(path), '--crop', 'centre',
+                 '--size', '32', '--keyframes', '--no-new-pixels', '--steps', '2',
+                 '--threads', '1', '--out', str(tmp_path / 'run')]) == 0
+    assert done == {(what, str(file)): 1 for what in ('opened', 'hashed')
+                    for file in bag.glob('*.mcap')}

@@ -60,8 +60,8 @@ def run(args: Options) -> None:
         processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
                         else DEFAULT_PREDICTOR)
         processes.start('visual_mpc_node')
-        token = {'token': args.token} if args.token else {}
-        processes.start('explorer_node', host=args.host, port=args.port, task=args.task, **token)
+        processes.start('explorer_node', host=args.host, port=args.port, task=args.task,
+                        token=args.token)
         print(f'starting nodes; their logs are in {folder}', flush=True)
         print(f'open {processes.wait_until_ready()} in a browser; Ctrl-C ends all nodes',
               flush=True)

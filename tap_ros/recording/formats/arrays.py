@@ -70,14 +70,12 @@ def run(args: Options) -> None:
                     arrays = dict(_arrays(root, skipped, budget, beside))
                     for name, number in zip(_chosen(arrays, args.camera), numbers):
                         with skipped.errors_of('array', f'{escaped(name)} of {place}'):
-                            seconds: list[float] = []
                             found = ((row / (args.fps or FPS), each)
                                      for row, each in enumerate(arrays[name]()))
-                            frames, rows = decoded(
-                                at_rate(found, args.rate, seconds),
+                            frames, times = decoded(
+                                at_rate(found, args.rate),
                                 lambda each: args.cut.image(_picture(each)), skipped,
                                 f'episode {number}')
-                            times = np.array(seconds)[rows]
                             signals = _signals(name, beside, np.rint(times * (
                                 args.fps or FPS)).astype(int), budget)
                             yield make_episode(frames, times, task=args.task, seed=number,

@@ -276,7 +276,7 @@ class DataSet:
         told = np.array(listed(part['timestamp']), float).ravel()
         if (np.abs(told - told[0] - seconds) > 0.5 / self.fps).any() and (np.diff(told) > 0).all():
             seconds = told - told[0]  # another rate than that of the description
-        taken = list(at_rate(zip(seconds.tolist(), range(len(part))), rate, []))
+        taken = [row for _, row in at_rate(zip(seconds.tolist(), range(len(part))), rate)]
         whole, part, seconds = len(taken) == len(part), part.take(taken), seconds[taken]
         cells, show = self._filmed(row, part) if self.is_video else (
             part[self.camera],  # rows may share what is in the file once
@@ -288,7 +288,7 @@ class DataSet:
             size = picture.shape[:2]
             return crop.image(picture)
 
-        frames, kept = decoded(cells, decode, self.skipped, f'episode {number}')
+        frames, kept = decoded(enumerate(cells), decode, self.skipped, f'episode {number}')
         T = len(kept)
 
         def numbers(key: str, width: int) -> np.ndarray:

@@ -113,14 +113,12 @@ def run(args: Options) -> None:
     def episodes() -> Iterator[Episode]:
         for number, path in enumerate(sorted(files, key=natural)):
             with skipped.errors_of('video', escaped(path.name)):
-                seconds: list[float] = []
                 found = ((row / args.fps if args.fps else at, show)
                          for row, (at, show) in enumerate(video_frames(path)))
-                frames, rows = decoded(
-                    at_rate(found, args.rate, seconds), lambda show: args.cut.image(show()),
-                    skipped, escaped(path.name))
-                yield make_episode(
-                    frames, np.array(seconds)[rows], task=args.task, seed=number)
+                frames, seconds = decoded(
+                    at_rate(found, args.rate), lambda show: args.cut.image(show()), skipped,
+                    escaped(path.name))
+                yield make_episode(frames, seconds, task=args.task, seed=number)
 
     print(write_bag(args, episodes(), skipped, len(files), jpeg=not args.size))
 
@@ -195,20 +193,21 @@ class Skipped:
             warnings.warn(line, RecordingWarning, stacklevel=3)
 
 
-def decoded(pictures: Iterable[Any], decode: Callable[[Any], np.ndarray], skipped: Skipped,
-            place: str) -> tuple[list[np.ndarray], np.ndarray]:
+def decoded(pictures: Iterable[tuple[float, Any]], decode: Callable[[Any], np.ndarray],
+            skipped: Skipped, place: str) -> tuple[list[np.ndarray], np.ndarray]:
     """
     Decode the pictures of an episode, but those that cannot be used.
 
+    :param pictures: of each a number, such as its time, and what is decoded.
     :param place: of the episode, for what is noted as skipped.
-    :return: the pictures, and which ones they are, (T,).
+    :return: the pictures, and their numbers, (T,).
     :raises ValueError: when there is none.
     """
-    frames, rows, size = [], [], 0
-    for row, each in enumerate(pictures):
+    frames, numbers, size = [], list[float](), 0
+    for row, (number, each) in enumerate(pictures):
         with skipped.errors_of('picture', f'{row} of {place}'):
             frames.append(decode(each))
-            rows.append(row)
+            numbers.append(number)
             size += frames[-1].nbytes
         if row >= MOST_FRAMES or size > MOST_BYTES:
             raise RecordingError(
@@ -216,7 +215,7 @@ def decoded(pictures: Iterable[Any], decode: Callable[[Any], np.ndarray], skippe
                 'demonstrations, or keep less of each picture (--size)')
     if not frames:
         raise ValueError('none of its pictures can be used')
-    return frames, np.array(rows)
+    return frames, np.array(numbers)
 
 
 def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.ndarray,

@@ -66,20 +66,18 @@ def run(args: Options) -> None:
                     floats: dict[str, np.ndarray] = {}
                     features = parse_example(data, floats)
                     camera = _choose(features, camera)
-                    seconds: list[float] = []
-                    found = ((row / (args.fps or FPS), each)
-                             for row, each in enumerate(_pictures(features, camera)))
-                    frames, rows = decoded(at_rate(found, args.rate, seconds), _picture, skipped,
-                                           f'record {place}')
+                    pictures = _pictures(features, camera)
+                    found = ((row / (args.fps or FPS), each) for row, each in enumerate(pictures))
+                    frames, times = decoded(at_rate(found, args.rate), _picture, skipped,
+                                            f'record {place}')
                     is_blank = _is_blank(frames[0])
                     blank[is_blank] += 1
                     said = features.get('steps/language_instruction') or [args.task.encode()]
                     if not is_blank:
-                        times = np.array(seconds)[rows]
+                        rows = np.rint(times * (args.fps or FPS)).astype(int)
                         yield make_episode(
-                            list(map(args.cut.image, frames)), times, **_signals(
-                                floats, len(_pictures(features, camera)),
-                                np.rint(times * (args.fps or FPS)).astype(int)),
+                            list(map(args.cut.image, frames)), times,
+                            **_signals(floats, len(pictures), rows),
                             task=said[0].decode(errors='replace'), seed=number)
 
     print(f'{write_bag(args, episodes(), skipped)} of {escaped(camera)}')

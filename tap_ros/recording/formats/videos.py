@@ -88,14 +88,12 @@ def _check_size(width: float, height: float) -> None:
                              f'{MAX_PICTURE_BYTES} bytes of rgb; make it smaller')
 
 
-def at_rate(items: Iterable[tuple[float, Item]], rate: float,
-            seconds: list[float]) -> Iterator[Item]:
+def at_rate(items: Iterable[tuple[float, Item]], rate: float) -> Iterator[tuple[float, Item]]:
     """
-    Yield the first item in each period of a rate.
+    Yield the first (seconds, item) in each period of a rate.
 
-    :param items: (seconds, item), in order of time.
+    :param items: in order of time.
     :param rate: a second; 0: all of them.
-    :param seconds: the times of those that are taken are appended.
     :raises RecordingError: for more than a demonstration has.
     """
     period = -1
@@ -106,5 +104,4 @@ def at_rate(items: Iterable[tuple[float, Item]], rate: float,
         now = math.floor(at * rate + 1e-6) if rate and math.isfinite(at) else period + 1
         if now > period:
             period = now
-            seconds.append(at)
-            yield item
+            yield at, item
