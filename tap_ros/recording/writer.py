@@ -37,8 +37,7 @@ from tap_ros.recording.messages import encode, schema_text, type_hash, typestore
 EPISODE_GAP_NS = 10**9  # between episodes whose stamps do not follow each other
 LIBRARY = 'tap_ros 1'
 CHUNK_BYTES = 786432  # rosbag2's default
-_COMPRESSIONS = {'none': CompressionType.NONE, '': CompressionType.NONE,
-                 'zstd': CompressionType.ZSTD, 'lz4': CompressionType.LZ4}
+_COMPRESSIONS = {one.name.lower(): one for one in CompressionType}
 
 
 class FileWriter:

@@ -35,6 +35,7 @@ from tap_ros.recording.formats.pictures import (
     find_files,
     make_episode,
     Options,
+    signal_fields,
     Skipped,
     write_bag,
 )
@@ -123,19 +124,15 @@ def _signals(name: str, numbers: Mapping[str, Any], rows: np.ndarray,
     :param numbers: arrays of numbers by their paths.
     :param rows: (T,), of the pictures that are taken.
     """
-    place, names, values = _demonstration(name), list[str](), [np.empty((len(rows), 0))]
+    place, found, left = _demonstration(name), dict[str, np.ndarray](), MOST_SIGNALS
     for path in sorted(numbers):
         array = numbers[path]
         width = math.prod(array.shape[1:])
-        if (_demonstration(path) == place and len(array) > rows.max()
-                and len(names) + width <= MOST_SIGNALS):
+        if _demonstration(path) == place and len(array) > rows.max() and width <= left:
             budget.take(array.nbytes)
-            values.append(array[:].reshape(len(array), width)[rows])
-            short = escaped(path.removeprefix(place), 60)
-            names += [short] if width == 1 else [f'{short}/{k}' for k in range(width)]
-    with np.errstate(over='ignore'):  # absurd numbers become infinite
-        signals = np.concatenate(values, 1).astype(np.float32)
-    return {'signal_names': tuple(names), 'signals': signals} if names else {}
+            left -= width
+            found[path.removeprefix(place)] = array[:].reshape(len(array), width)[rows]
+    return signal_fields(found)
 
 
 def _arrays(root: Any, skipped: Skipped, budget: Budget, numbers: dict[str, Any],

@@ -8,7 +8,7 @@ another meaning.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -247,6 +247,17 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
     return Episode(frames=np.stack(frames), object_names=object_names,
                    stamps=np.round(seconds * 1e9).astype(np.int64),
                    **(fields | known))
+
+
+def signal_fields(found: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return the fields of an Episode with numbers by name, (T, width) each; {} without any."""
+    if not found:
+        return {}
+    names = [escaped(name, 60) + (f'/{k}' if values.shape[1] > 1 else '')
+             for name, values in found.items() for k in range(values.shape[1])]
+    with np.errstate(over='ignore'):  # absurd numbers become infinite
+        signals = np.concatenate([*found.values()], 1, dtype=float, casting='unsafe')
+        return {'signal_names': tuple(names), 'signals': signals.astype(np.float32)}
 
 
 def _is_free(folder: Path) -> bool:

@@ -35,6 +35,7 @@ from tap_ros.recording.formats.pictures import (
     find_files,
     make_episode,
     Options,
+    signal_fields,
     Skipped,
     write_bag,
 )
@@ -136,15 +137,14 @@ def _signals(floats: dict[str, np.ndarray], length: int, rows: np.ndarray) -> di
     for name in sorted(floats, key=lambda name: natural(Path(name))):
         if match := re.fullmatch(r'(?:steps|\d+)/(.+)', name):  # BAIR has a feature a step
             parts.setdefault(match[1], []).append(floats[name])
-    names, values = list[str](), [np.empty((len(rows), 0), np.float32)]
-    for name, found in sorted(parts.items()):
-        value = np.concatenate(found)
+    found, left = dict[str, np.ndarray](), MOST_SIGNALS
+    for name, values in sorted(parts.items()):
+        value = np.concatenate(values)
         width = len(value) // length
-        if 0 < width <= MOST_SIGNALS - len(names) and width * length == len(value):
-            values.append(value.reshape(length, width)[rows])
-            short = escaped(name, 60)
-            names += [short] if width == 1 else [f'{short}/{k}' for k in range(width)]
-    return {'signal_names': tuple(names), 'signals': np.concatenate(values, 1)} if names else {}
+        if 0 < width <= left and width * length == len(value):
+            left -= width
+            found[name] = value.reshape(length, width)[rows]
+    return signal_fields(found)
 
 
 def _is_picture(data: bytes) -> bool:
