@@ -10,7 +10,7 @@ import json
 from made_episodes import make_episode, move_squares, write_bag
 import numpy as np
 import pytest
-from tap_ros.apps.cli import main
+from tap_ros.__main__ import main
 from tap_ros.base.errors import ConfigError
 from tap_ros.recording import known
 from tap_ros.recording.cache import open_recordings
