@@ -85,22 +85,21 @@ def demonstrate(stage: Stage, seed: int, num_frames: int = 0) -> Demonstration:
 
     :param num_frames: at most; 0: MOST_FRAMES.
     """
+    # With the readers of other formats, which the table does without.
+    from tap_ros.recording.formats.pictures import make_episode
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, attempt])
         stage.begin(int(rng.integers(2 ** 31)))
         rows, done = _act_unsteadily(stage, rng, num_frames or MOST_FRAMES)
         if done and len(rows) >= LEAST_FRAMES:
             break
-    frames, commands, hands, places = map(np.stack, zip(*rows))
+    frames, *others = zip(*rows)
+    commands, hands, places = map(np.stack, others)
     commands[-1] = 0
-    T = len(rows)
-    episode = Episode(
-        frames=frames, stamps=np.arange(T) * stage.steps * stage.step_ns,
-        actions=commands.astype(np.float32), grippers=np.full((T, 4), np.nan, np.float32),
-        object_names=(), object_pixels=np.zeros((T, 0, 2), np.float32),
-        object_poses=np.zeros((T, 0, 7)), goal_frame=None,
-        goal_pixels=np.zeros((0, 2), np.float32), goal_poses=np.zeros((0, 7)),
-        task=stage.task_name, seed=seed, outcome='success' if done else 'failure')
+    episode = make_episode(
+        frames, np.arange(len(rows)) * stage.steps * stage.step_ns / 1e9,
+        actions=commands.astype(np.float32), object_source='', task=stage.task_name, seed=seed,
+        outcome='success' if done else 'failure')
     return Demonstration(episode, find_bottleneck(hands, places))
 
 

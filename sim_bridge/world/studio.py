@@ -180,9 +180,6 @@ def _studio_model(arm: Arm | None) -> mujoco.MjModel:
     _add_furniture(spec)
     if arm is not None:
         _add_arm(spec, arm)
-        for geom in spec.geoms:
-            if geom.parent.name != 'world':
-                geom.group = ARM_GEOM_GROUP
     return spec.compile()
 
 
@@ -203,7 +200,7 @@ def _add_arm(spec: mujoco.MjSpec, arm: Arm) -> None:
         kind = mujoco.mjtGeom.mjGEOM_CAPSULE if shape.capsule else mujoco.mjtGeom.mjGEOM_CYLINDER
         bodies[shape.link].add_geom(
             type=kind, fromto=[*shape.start, *shape.end], size=[shape.radius, 0, 0],
-            rgba=[*shape.colour, 1], contype=0, conaffinity=0)
+            rgba=[*shape.colour, 1], contype=0, conaffinity=0, group=ARM_GEOM_GROUP)
 
 
 def _add_furniture(spec: mujoco.MjSpec) -> None:

@@ -15,6 +15,7 @@ import pytest
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording import cache as cache_module
 from tap_ros.recording import known
+from tap_ros.recording.bags import known_bags
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.reading import Reading
@@ -69,6 +70,15 @@ def test_a_file_is_opened_and_hashed_once_and_again_when_it_has_changed(
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert_all_equal(open_recordings(bag), episodes)
     assert done == {'opened': 6, 'hashed': 4}  # what it holds is known
+
+
+def test_a_bag_is_known_until_a_file_of_it_changes(bag):
+    first, = known_bags(bag)
+    assert known_bags([bag]) == [first] and first.opened == first.opened
+    with EpisodeWriter(bag / 'push2_1.mcap') as writer:
+        writer.write(make_episode(seed=99))
+    again, = known_bags(bag)
+    assert again is not first
 
 
 def test_damaged_caches_are_built_again(bag, episodes, cache):
