@@ -409,13 +409,41 @@ def test_a_message_that_unpacks_to_more_than_a_picture_is_left_out(tmp_path):
     'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(100) AS data FROM n',
     'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, '
     'data BLOB GENERATED ALWAYS AS (zeroblob(900000000)))',
-    "CREATE TABLE messages AS SELECT 1 id, 1 topic_id, 'x' timestamp, 5 data"])
+    "CREATE TABLE messages AS SELECT 1 id, 1 topic_id, 'x' timestamp, 5 data",
+    'CREATE VIEW Messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
+    'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(100) AS data FROM n',
+    'CREATE TABLE MESSAGES(id INTEGER PRIMARY KEY, topic_id, timestamp, '
+    'data BLOB AS (zeroblob(900000000)))'])
 def test_a_base_of_views_and_formulas_is_refused(change, tmp_path):
     file = write_bare_db3(tmp_path)
     with sqlite3.connect(file) as base:
         base.execute('DROP TABLE messages')
         base.execute(change)
     with pytest.raises(RecordingError):
+        open_recordings(file)
+
+
+def test_a_base_whose_pages_stand_in_each_other_has_an_end(tmp_path):
+    file = write_bare_db3(tmp_path)
+    with sqlite3.connect(file) as base:
+        root, = base.execute(
+            "SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+        size, = base.execute('PRAGMA page_size').fetchone()
+    data, leaf = bytearray(file.read_bytes()), size // 2
+    pages = len(data) // size
+    for page in range(pages + 1, pages + 9):  # a tree of nine storeys, all of one leaf
+        below = page + 1 if page < pages + 8 else pages + 9
+        cells = b''.join(struct.pack('>IB', below, 1) for _ in range(100))
+        start = size - len(cells)
+        data += (struct.pack('>BHHHBI', 5, 0, 100, start, 0, below) + struct.pack(
+            '>100H', *range(start, size, 5))).ljust(start, b'\0') + cells
+    row = bytes([7, 1, 5, 0, 1, 1, 14]) + bytes([1, 1]) + b'x'
+    data += (struct.pack('>BHHHB', 13, 0, 1, leaf, 0) + struct.pack('>H', leaf)).ljust(
+        leaf, b'\0') + row.ljust(leaf, b'\0')
+    data[(root - 1) * size:root * size] = data[pages * size:(pages + 1) * size]
+    data[28:32] = struct.pack('>I', len(data) // size)
+    file.write_bytes(data)
+    with pytest.raises(RecordingError, match='interrupted'):
         open_recordings(file)
 
 
