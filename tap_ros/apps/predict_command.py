@@ -10,7 +10,7 @@ from typing import Annotated, TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-from tap_ros.base.errors import ConfigError, ImageError
+from tap_ros.base.errors import ConfigError, ImageError, RecordingError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
 from tap_ros.base.text import escaped
@@ -19,6 +19,7 @@ from tap_ros.images.drawing import grid, OBJECT_COLOURS, overlay, png_bytes
 from tap_ros.images.encodings import decompress
 from tap_ros.images.pixels import in_picture, resize_image, resize_pixels
 from tap_ros.recording.reading import Part
+from tap_ros.recording.trust import read_bytes
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tyro import conf
 
@@ -118,7 +119,7 @@ def read_inputs(files: Mapping[str, str], positions: Mapping[str, Sequence[str]]
     :param files: of 'start' and 'goal', JPEG, PNG or WebP; '' where there is none.
     :param positions: by their options the positions in these, see read_pixels.
     :return: of those that are there uint8 (H, W, 3) rgb, and float32 (K, 2), (u, v).
-    :raises ImageError: for a file that is no picture, or is damaged.
+    :raises ImageError: for a file that is no picture, is damaged, or has no end.
     :raises ConfigError: for positions that are none, or without a picture.
     """
     pictures, pixels = {}, {}
@@ -129,9 +130,11 @@ def read_inputs(files: Mapping[str, str], positions: Mapping[str, Sequence[str]]
             pixels[name] = read_pixels(words, option)
             try:
                 pictures[name] = decompress(
-                    Path(file).read_bytes(), Path(file).suffix[1:], _LARGEST)
+                    read_bytes(file, _LARGEST), Path(file).suffix[1:], _LARGEST)
             except ImageError as error:
                 raise ImageError(f'{escaped(file)}: {error}') from error
+            except RecordingError as error:
+                raise ImageError(str(error)) from error
     return pictures, pixels
 
 

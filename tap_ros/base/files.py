@@ -10,10 +10,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 import errno
 import fcntl
-from io import FileIO
+from io import BufferedWriter
 import json
 import os
 from pathlib import Path
+import stat
 from typing import Any
 
 from tap_ros.base.errors import StorageError
@@ -32,13 +33,12 @@ def write_atomically(path: str | Path, data: bytes | bytearray | memoryview | st
     """
     path = Path(path)
     part = path.with_name(f'{path.name}.part')
-    rest = memoryview(data.encode() if isinstance(data, str) else data)
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _open_alone(part) as stream:
+        with open_alone(part) as stream:
             try:
-                while rest:
-                    rest = rest[stream.write(rest):]
+                stream.write(data.encode() if isinstance(data, str) else data)
+                stream.flush()
                 os.fsync(stream.fileno())
                 os.replace(part, path)
             except BaseException:
@@ -107,7 +107,8 @@ def only_keeper(path: str | Path) -> Iterator[None]:
     :raises StorageError: when another process keeps it, or its folder cannot be written to.
     """
     path = Path(path).resolve()
-    with _locked(path, path.with_name(f'.{path.name}.lock'), os.O_RDONLY | os.O_CREAT,
+    flags = os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+    with _locked(path, path.with_name(f'.{path.name}.lock'), flags,
                  'keeps it; end that one, or choose another file'):
         yield
 
@@ -146,13 +147,28 @@ def _lock(handle: int, wait: bool) -> bool:
     return True
 
 
-def _open_alone(part: Path) -> FileIO:
-    """Open a file, empty, that no other process writes at once; one left by a kill serves."""
+def open_alone(part: Path) -> BufferedWriter:
+    """
+    Open a file, empty, that no other process writes at once; one left by a kill serves.
+
+    The folder may be a stranger's: what is no regular file, or another file's second name, is not
+    written to.
+
+    :raises StorageError: when it is such.
+    """
+    other = StorageError(f'{escaped(part)}: is a link, or no regular file; remove it, then start '
+                         'again')
     while True:
-        stream = open(part, 'ab', buffering=0)
+        try:
+            stream = open(part, 'ab', opener=_without_links)
+        except OSError as error:
+            raise (other if error.errno in (errno.ELOOP, errno.ENXIO) else error) from None
         _lock(stream.fileno(), wait=True)
         try:
-            if os.path.samestat(os.fstat(stream.fileno()), os.stat(part)):
+            found = os.fstat(stream.fileno())
+            if os.path.samestat(found, os.lstat(part)):
+                if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                    raise other
                 stream.truncate(0)
                 return stream
         except FileNotFoundError:  # another process has given it its name in the meantime
@@ -161,3 +177,8 @@ def _open_alone(part: Path) -> FileIO:
             stream.close()
             raise
         stream.close()
+
+
+def _without_links(path: str, flags: int) -> int:
+    """Open a file, but not where a link leads; wait for no reader of a pipe."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)

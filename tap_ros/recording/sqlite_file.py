@@ -14,10 +14,11 @@ from mcap.summary import Summary
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.text import escaped
 from tap_ros.recording.defects import Defect, FAR
-from tap_ros.recording.mcap_file import Channel, Found, McapFile
+from tap_ros.recording.mcap_file import Channel, Found, MAX_CHUNK_BYTES, McapFile
 from tap_ros.recording.metadata import PACKED
 from tap_ros.recording.raw_files import beginning, bytes_of
 
+_STEP = 10**4  # instructions of sqlite for 100 bytes of a file; a row takes some tens
 SQLITE = b'SQLite format 3\0'
 
 
@@ -42,7 +43,8 @@ class SqliteFile(McapFile):
         """Learn of the channels, and how many messages each has."""
         for name, text in base.execute(  # a view or a formula may have no end
                 "SELECT name, sql FROM sqlite_master WHERE type IN ('table', 'view') "
-                "AND name IN ('topics', 'messages', 'message_definitions')"):
+                "AND lower(name) IN ('topics', 'messages', 'message_definitions')"):
+            text = str(text)
             if not re.match(r'CREATE TABLE\b', text) or re.search(r'(?i)\bAS\b', text):
                 raise ValueError(f'{name} is no plain table')
         texts = dict[str, str]()
@@ -89,11 +91,18 @@ class SqliteFile(McapFile):
         """Open the file, with what a killed recorder left beside it; nothing there is changed."""
         path = Path(self.path)
         if path.suffix in PACKED:
-            base = sqlite3.connect(':memory:')
-            base.deserialize(bytes_of(path))
-            return base
-        way = 'mode=ro' if path.with_name(f'{path.name}-wal').is_file() else 'immutable=1'
-        return sqlite3.connect(f'{path.absolute().as_uri()}?{way}', uri=True)
+            base, data = sqlite3.connect(':memory:'), bytes_of(path)
+            base.deserialize(data)
+            size = len(data)
+        else:
+            size, log = self._size, path.with_name(f'{path.name}-wal')
+            size += log.stat().st_size if log.is_file() else 0
+            way = 'mode=ro' if log.is_file() else 'immutable=1'
+            base = sqlite3.connect(f'{path.absolute().as_uri()}?{way}', uri=True)
+        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
+        steps = iter(range(1000 + size // 100))  # pages may stand in each other: rows without end
+        base.set_progress_handler(lambda: next(steps, None) is None, _STEP)
+        return base
 
 
 def open_file(path: Path) -> McapFile:

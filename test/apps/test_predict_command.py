@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`python -m tap_ros predict` on picture files."""
 
+import os
 import re
 
 import cv2
@@ -69,7 +70,14 @@ def test_what_cannot_be_used_is_named_and_nothing_is_written(files, tmp_path, ca
             (['--crop', '0,0,20', '--objects', '40,9', '--goal-objects', '1,2'], 'outside the')):
         assert named in refusal(capsys, *files, '--out', str(out), *change), change
         assert not out.exists()
-    for name, named in (('absent.png', 'No such file'), ('text.png', 'valid are JPEG, PNG'),
+    os.mkfifo(tmp_path / 'fifo.png')
+    (tmp_path / 'zero').symlink_to('/dev/zero')
+    (tmp_path / 'sparse.png').touch()
+    os.truncate(tmp_path / 'sparse.png', 30 * 2**30)
+    for name, named in (('absent.png', 'absent.png is not there'),
+                        ('', 'no regular file'), ('fifo.png', 'no regular file'),
+                        ('zero', 'no regular file'), ('sparse.png', 'has more than'),
+                        ('text.png', 'valid are JPEG, PNG'),
                         ('wide.png', '96x64')):
         assert named in refusal(capsys, str(tmp_path / name), files[1]), name
 

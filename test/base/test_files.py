@@ -11,7 +11,7 @@ from threading import Thread
 import pytest
 from tap_ros.__main__ import main
 from tap_ros.base.errors import StorageError
-from tap_ros.base.files import only_writer, write_atomically
+from tap_ros.base.files import only_keeper, only_writer, write_atomically
 
 HOLD = ('import sys; from tap_ros.base.files import only_writer\n'
         'with only_writer(sys.argv[1]): print(1, flush=True); sys.stdin.read()')
@@ -42,6 +42,23 @@ def test_what_a_killed_writer_left_is_used_again(tmp_path):
     (tmp_path / 'a.part').write_bytes(bytes(100))
     write_atomically(tmp_path / 'a', 'whole')
     assert (tmp_path / 'a').read_text() == 'whole' and os.listdir(tmp_path) == ['a']
+
+
+@pytest.mark.parametrize('put', [
+    os.symlink, os.link, lambda _, part: os.mkfifo(part), lambda _, part: os.symlink('no', part)])
+def test_what_a_stranger_put_where_a_file_is_written_first_is_not_followed(put, tmp_path):
+    outside, folder = tmp_path / 'outside', tmp_path / 'in'
+    outside.write_text('precious')
+    folder.mkdir()
+    (folder / 'a').write_text('old')
+    for name, write in (('a.part', lambda: write_atomically(folder / 'a', 'new')),
+                        ('.a.lock', only_keeper(folder / 'a').__enter__)):
+        put(outside, folder / name)
+        if (folder / name).is_symlink() or name == 'a.part':
+            with pytest.raises(StorageError, match=f'{name}: is a link.*|a: cannot be written'):
+                write()
+    assert outside.read_text() == 'precious' and (folder / 'a').read_text() == 'old'
+    assert not (folder / 'no').exists() and not (folder / 'a').is_symlink()
 
 
 def test_writers_at_once_never_mix(tmp_path):

@@ -24,9 +24,10 @@ import pyarrow
 from pyarrow import parquet
 import pytest
 from tap_ros.__main__ import main
-from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.errors import ConfigError, RecordingError, StorageError
 from tap_ros.recording import mcap_file
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.formats.lerobot_subtasks import Ends, write_subtasks
 from tap_ros.recording.marks import read_marks
 from tap_ros.recording.metadata import FILE_NAME, from_yaml
 from tap_ros.recording.trust import Budget, inside
@@ -408,13 +409,41 @@ def test_a_message_that_unpacks_to_more_than_a_picture_is_left_out(tmp_path):
     'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(100) AS data FROM n',
     'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, '
     'data BLOB GENERATED ALWAYS AS (zeroblob(900000000)))',
-    "CREATE TABLE messages AS SELECT 1 id, 1 topic_id, 'x' timestamp, 5 data"])
+    "CREATE TABLE messages AS SELECT 1 id, 1 topic_id, 'x' timestamp, 5 data",
+    'CREATE VIEW Messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
+    'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(100) AS data FROM n',
+    'CREATE TABLE MESSAGES(id INTEGER PRIMARY KEY, topic_id, timestamp, '
+    'data BLOB AS (zeroblob(900000000)))'])
 def test_a_base_of_views_and_formulas_is_refused(change, tmp_path):
     file = write_bare_db3(tmp_path)
     with sqlite3.connect(file) as base:
         base.execute('DROP TABLE messages')
         base.execute(change)
     with pytest.raises(RecordingError):
+        open_recordings(file)
+
+
+def test_a_base_whose_pages_stand_in_each_other_has_an_end(tmp_path):
+    file = write_bare_db3(tmp_path)
+    with sqlite3.connect(file) as base:
+        root, = base.execute(
+            "SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+        size, = base.execute('PRAGMA page_size').fetchone()
+    data, leaf = bytearray(file.read_bytes()), size // 2
+    pages = len(data) // size
+    for page in range(pages + 1, pages + 9):  # a tree of nine storeys, all of one leaf
+        below = page + 1 if page < pages + 8 else pages + 9
+        cells = b''.join(struct.pack('>IB', below, 1) for _ in range(100))
+        start = size - len(cells)
+        data += (struct.pack('>BHHHBI', 5, 0, 100, start, 0, below) + struct.pack(
+            '>100H', *range(start, size, 5))).ljust(start, b'\0') + cells
+    row = bytes([7, 1, 5, 0, 1, 1, 14]) + bytes([1, 1]) + b'x'
+    data += (struct.pack('>BHHHB', 13, 0, 1, leaf, 0) + struct.pack('>H', leaf)).ljust(
+        leaf, b'\0') + row.ljust(leaf, b'\0')
+    data[(root - 1) * size:root * size] = data[pages * size:(pages + 1) * size]
+    data[28:32] = struct.pack('>I', len(data) // size)
+    file.write_bytes(data)
+    with pytest.raises(RecordingError, match='interrupted'):
         open_recordings(file)
 
 
@@ -469,3 +498,48 @@ def test_a_row_of_more_than_numbers_and_names_is_not_unpacked(values, tmp_path, 
         'episode_index': e, 'length': length}) for e, length in enumerate((3, 1))))
     frames, said = run('import-lerobot', folder)
     assert len(frames) == 1 and 'more than numbers' in said
+
+
+def labelled(folder, **changes):
+    """Write a set that subtasks can be written into, and what they are."""
+    lerobot(folder, **changes)
+    (folder / 'data').rename(folder / 'chunk')
+    (folder / 'data').mkdir()
+    (folder / 'chunk').rename(folder / 'data/chunk')
+    return folder, ['before', 'after'], {episode: Ends([0.2], 0.4) for episode in range(2)}
+
+
+@pytest.mark.parametrize('name', [
+    'data/chunk/000.parquet', 'data/chunk/001.parquet', 'meta/info.json',
+    'meta/subtasks.parquet'])
+def test_subtasks_are_written_into_the_set_alone(name, secret, tmp_path):
+    folder, *given = labelled(tmp_path / 'set')
+    (folder / f'{name}.part').symlink_to(secret)
+    before = contents(folder)
+    with pytest.raises(StorageError, match=f'{name}.part: is a link'):
+        write_subtasks(folder, *given)
+    assert secret.read_bytes() == SECRET and contents(folder) == before
+    (folder / f'{name}.part').unlink()
+    assert write_subtasks(folder, *given) == 6
+
+
+@pytest.mark.parametrize('fps, rows, told, said', [
+    (0, {}, {}, 'set: is no LeRobot data set: 0.0 frames'), ('nan', {}, {}, 'is no LeRobot'),
+    *((5, {}, {'huggingface': text}, '001.parquet: ') for text in (
+        '{}', '[]', '{"info": {"features": []}}', 'x', DEEP)),
+    (5, {'timestamp': ['a', 'b', 'c']}, {}, '001.parquet: '),
+    (5, {'timestamp': 3 * [[]]}, {}, '001.parquet: '), (5, None, {}, '001.parquet: ')])
+def test_a_damaged_set_gets_no_subtasks_in_one_line(fps, rows, told, said, tmp_path):
+    folder, *given = labelled(tmp_path / 'set', fps=fps, rows=rows or ())
+    file = folder / 'data/chunk/001.parquet'
+    parquet.write_table(parquet.read_table(file).replace_schema_metadata(told), file)
+    if rows is None:
+        file.write_bytes(b'PAR1xxxxPAR1')
+    before = contents(folder)
+    with pytest.raises(RecordingError, match=said) as error:
+        write_subtasks(folder, *given)
+    assert contents(folder) == before and str(error.value).isprintable()
+
+
+def contents(folder):
+    return {file: file.read_bytes() for file in folder.rglob('*') if file.is_file()}

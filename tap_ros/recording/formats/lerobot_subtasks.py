@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 import json
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from tap_ros.base.errors import ConfigError, RecordingError
-from tap_ros.base.files import storage_errors, write_atomically
+from tap_ros.base.files import open_alone, storage_errors
 from tap_ros.base.text import escaped
 from tap_ros.recording.formats.lerobot_format import (
     INDEX,
@@ -24,6 +24,7 @@ from tap_ros.recording.formats.lerobot_format import (
     names_table,
     SUBTASK,
 )
+from tap_ros.recording.formats.pictures import DAMAGE
 from tap_ros.recording.trust import inside, parse_json, read_bytes
 
 
@@ -49,7 +50,7 @@ def write_subtasks(folder: str | Path, names: Sequence[str], episodes: Mapping[i
     """
     Write subtasks into a data set; those that it had are replaced.
 
-    Data files are written beside the old ones first and take their places together.
+    Files are written beside the old ones first and take their places together.
 
     :param folder: of the data set, with meta/info.json.
     :param names: of the subtasks, one more than the ends of an episode.
@@ -65,39 +66,52 @@ def write_subtasks(folder: str | Path, names: Sequence[str], episodes: Mapping[i
     try:
         info = parse_json(read_bytes(inside(root, INFO), MOST_BYTES))
         info['features'][SUBTASK], fps = INDEX, float(info['fps'])
+        if not fps > 0:
+            raise ValueError(f'{fps} frames a second')
     except (OSError, RecordingError, LookupError, TypeError, ValueError) as error:
         raise RecordingError(
             f'{escaped(root)}: is no LeRobot data set: {escaped(error)}') from error
     done: dict[Path, Path] = {}
     rows, lengths = 0, dict[int, float]()
+
+    def beside(path: Path) -> BinaryIO:
+        part = path.with_name(f'{path.name}.part')
+        stream = open_alone(part)
+        done[path] = part
+        return stream
+
     try:
         with storage_errors(root):
+            with beside(root / 'meta/subtasks.parquet') as stream:
+                parquet.write_table(names_table('subtask', {
+                    name: k for k, name in enumerate(names)}), stream)
             for name in sorted(root.glob('data/*/*.parquet')):
                 path = inside(root, name.relative_to(root))
-                done[path] = path.with_name(f'{path.name}.part')
-                rows += _with_subtasks(path, done[path], episodes, lengths)
-            if not done:
-                raise RecordingError(f'{escaped(root)}: has no data/*/*.parquet')
+                try:
+                    with beside(path) as stream:
+                        rows += _with_subtasks(path, stream, episodes, lengths)
+                except (*DAMAGE, pyarrow.ArrowException) as error:
+                    if isinstance(error, RecordingError) or getattr(error, 'errno', None):
+                        raise  # which tells all, or is of storage
+                    raise RecordingError(f'{escaped(path)}: {escaped(error, 200)}') from error
+            if not lengths:
+                raise RecordingError(f'{escaped(root)}: has no rows in data/*/*.parquet')
             other = [i for i in sorted({*lengths, *episodes}) if i not in lengths or abs(
                 lengths[i] - episodes[i].length) > 1.5 / fps]
             if other:
                 raise ConfigError(f'{escaped(root)}: episode {other[0]} is another one than in '
                                   'the recordings; name the set that they were imported from')
+            with beside(root / INFO) as stream:
+                stream.write(json.dumps(info, indent=4).encode() + b'\n')
             for path, part in done.items():
                 os.replace(part, path)
-    except pyarrow.ArrowException as error:
-        raise RecordingError(f'{escaped(root)}: {escaped(error, 200)}') from error
     finally:
         for part in done.values():
             part.unlink(missing_ok=True)
-    sink = pyarrow.BufferOutputStream()
-    parquet.write_table(names_table('subtask', {name: k for k, name in enumerate(names)}), sink)
-    write_atomically(root / 'meta/subtasks.parquet', sink.getvalue().to_pybytes())
-    write_atomically(root / INFO, json.dumps(info, indent=4) + '\n')
     return rows
 
 
-def _with_subtasks(path: Path, part: Path, given: Mapping[int, Ends],
+def _with_subtasks(path: Path, part: BinaryIO, given: Mapping[int, Ends],
                    lengths: dict[int, float]) -> int:
     """Copy a data file with its rows' subtasks, note its episodes; return the number of rows."""
     import pyarrow
