@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
+import re
 from typing import Any, TypeVar
 
 from safetensors import SafetensorError
@@ -21,11 +22,15 @@ from tap_ros.base.errors import TapError, WeightsError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.text import escaped, listing
 import torch
+from torch.overrides import TorchFunctionMode
 
 Config = TypeVar('Config')  # a dataclass
 Network = TypeVar('Network', bound=torch.nn.Module)
 
 _FORMAT = 'tap_ros 2'  # 1 had no SHA-256
+_MOST_BYTES = 2**32  # of a file; of the paper's network with all that a training keeps 2**28
+_KINDS = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int32, torch.int64,
+          torch.uint8, torch.bool}  # of numbers that are written, and can be computed with
 _AGAIN = 'copy it again, or train again'
 
 
@@ -96,9 +101,12 @@ def make_network(network_class: Callable[[Config], Network], config_class: type[
         raise WeightsError(f'{escaped(path)}: {what}; known are {", ".join(sorted(known))}. Use '
                            'the tap_ros version that wrote it, or train again')
     try:
-        network = network_class(config_class(**{
+        config = config_class(**{
             name: tuple(value) if isinstance(value, list) else value
-            for name, value in values.items()}))
+            for name, value in values.items()})
+        with _Unfilled():  # a short file may ask for a network of many gigabytes
+            network_class(config).load_state_dict(state)
+        network = network_class(config)
         network.load_state_dict(state)
     except TapError as error:
         raise WeightsError(f'{escaped(path)}: {error}') from error
@@ -107,6 +115,20 @@ def make_network(network_class: Callable[[Config], Network], config_class: type[
         raise WeightsError(f'{escaped(path)}: does not fit its own configuration '
                            f'({escaped(" ".join(str(error).split()), 300)}); {_AGAIN}') from error
     return network
+
+
+class _Unfilled(TorchFunctionMode):
+    """
+    Within, nothing is filled or drawn: networks take no memory, but their shapes can be compared.
+
+    Other than on the device 'meta', whose random numbers import sympy, for seconds.
+    """
+
+    def __torch_function__(self, func: Callable[..., Any], types: Any, args: Any = (),
+                           kwargs: Any = None) -> Any:
+        if re.fullmatch(r'[a-z]\w*_', func.__name__):  # in place, by PyTorch's convention
+            return args[0] if args else None
+        return func(*args, **(kwargs or {}))
 
 
 def save_tensors(path: str | Path, tensors: Mapping[str, torch.Tensor],
@@ -155,6 +177,9 @@ def _load(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, Any], st
         if not os.path.isfile(path):  # a pipe would wait for somebody to write to it
             raise WeightsError(f'{name}: no such weights file; train one with `python -m tap_ros '
                                'train`, or give another .safetensors file')
+        if os.path.getsize(path) > _MOST_BYTES:
+            raise WeightsError(f'{name}: has more than {_MOST_BYTES >> 30} GiB, as no weights '
+                               'have; give another .safetensors file')
         data = Path(path).read_bytes()
     except (OSError, ValueError, MemoryError) as error:
         raise WeightsError(f'{name}: cannot be read: '
@@ -176,6 +201,9 @@ def _load(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, Any], st
     if digest != metadata['sha256']:
         raise WeightsError(f'{name}: damaged: its content has another SHA-256 than was written '
                            f'with it; {_AGAIN}')
+    if others := {str(tensor.dtype) for tensor in tensors.values() if tensor.dtype not in _KINDS}:
+        raise WeightsError(f'{name}: holds numbers of the kind {listing(sorted(others))}, which '
+                           'are not written; train again')
     if not isinstance(about, dict):
         raise WeightsError(f'{name}: does not describe what it holds; train again')
     return tensors, about, digest

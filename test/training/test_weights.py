@@ -3,6 +3,7 @@
 """Laws of weights files, and what is said about files that are none."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -115,3 +116,25 @@ def test_configurations_that_cannot_be_are_refused_in_one_line(path, tmp_path):
             save_tensors(tmp_path / 'w', tensors, {
                 **about, 'config': {**about['config'], name: value}})
             assert len(refusal(load, tmp_path / 'w')) < 700
+
+
+def test_numbers_that_are_never_written_and_files_without_end_are_refused(path, tmp_path):
+    tensors, about = load_tensors(path)
+    name = next(iter(tensors))
+    for kind in (torch.float8_e4m3fn, torch.complex64, torch.uint16):
+        save_tensors(tmp_path / 'w', {**tensors, name: torch.zeros(3, 3).to(kind)}, about)
+        assert str(kind) in refusal(load_network, tmp_path / 'w')
+    (tmp_path / 'w').write_bytes(b'')
+    os.truncate(tmp_path / 'w', 30 * 2**30)
+    assert 'more than 4 GiB' in refusal(load_network, tmp_path / 'w')
+
+
+def test_a_network_that_its_file_cannot_fill_is_not_made(path, tmp_path):
+    tensors, about = load_tensors(path)
+    save_tensors(tmp_path / 'w', tensors, {**about, 'config': {
+        **about['config'], 'base_width': 2**11}})
+    before = torch.get_rng_state()
+    assert 'does not fit its own configuration' in refusal(load_network, tmp_path / 'w')
+    assert torch.get_rng_state().equal(before)  # no weight was drawn
+    network, _ = load_network(path)
+    assert all(value.equal(tensors[name]) for name, value in network.state_dict().items())
