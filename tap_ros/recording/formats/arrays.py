@@ -66,7 +66,8 @@ def run(args: Options) -> None:
                 if why := (what_is if file.name.endswith('.zarr.zip') else what_else)(file):
                     raise RecordingError(why)
                 with h5py.File(file, 'r') as root:
-                    budget, beside = Budget(file.stat().st_size), dict[str, Any]()
+                    budget, beside = Budget(
+                        file.stat().st_size), dict[str, dict[str, Any]]()
                     arrays = dict(_arrays(root, skipped, budget, beside))
                     for name, number in zip(_chosen(arrays, args.camera), numbers):
                         with skipped.errors_of('array', f'{escaped(name)} of {place}'):
@@ -78,8 +79,9 @@ def run(args: Options) -> None:
                                 lambda each: args.cut.image(_picture(each)), skipped,
                                 f'episode {number}')
                             times = np.array(seconds)[rows]
-                            signals = _signals(name, beside, np.rint(times * (
-                                args.fps or FPS)).astype(int), budget)
+                            signals = _signals(
+                                beside.get(_demonstration(name), {}),
+                                np.rint(times * (args.fps or FPS)).astype(int), budget, skipped)
                             yield make_episode(frames, times, task=args.task, seed=number,
                                                **signals)
 
@@ -116,33 +118,33 @@ def _demonstration(name: str) -> str:
     return '/'.join([*groups[:last], ''])
 
 
-def _signals(name: str, numbers: Mapping[str, Any], rows: np.ndarray,
-             budget: Budget) -> dict[str, Any]:
+def _signals(numbers: Mapping[str, Any], rows: np.ndarray, budget: Budget,
+             skipped: Skipped) -> dict[str, Any]:
     """
     Return the fields of an Episode with the numbers beside an array of pictures.
 
-    :param name: of the array of pictures.
-    :param numbers: arrays of numbers by their paths.
+    :param numbers: arrays of numbers of the demonstration by their paths.
     :param rows: (T,), of the pictures that are taken.
     """
-    place, names, values = _demonstration(name), list[str](), [np.empty((len(rows), 0))]
-    for path in sorted(numbers):
-        array = numbers[path]
+    names, values = list[str](), [np.empty((len(rows), 0))]
+    for path, array in sorted(numbers.items()):
         width = math.prod(array.shape[1:])
-        if (_demonstration(path) == place and len(array) > rows.max()
-                and len(names) + width <= MOST_SIGNALS):
-            budget.take(array.nbytes)
-            values.append(array[:].reshape(len(array), width)[rows])
-            short = escaped(path.removeprefix(place), 60)
-            names += [short] if width == 1 else [f'{short}/{k}' for k in range(width)]
+        if len(array) > rows.max() and len(names) + width <= MOST_SIGNALS:
+            with skipped.errors_of(
+                    'array', f'{escaped(path)} of {escaped(Path(array.file.filename).name)}'):
+                budget.take(array.nbytes)
+                values.append(array[:].reshape(len(array), width)[rows])
+                short = escaped(path.removeprefix(_demonstration(path)), 60)
+                names += [short] if width == 1 else [f'{short}/{k}' for k in range(width)]
     with np.errstate(over='ignore'):  # absurd numbers become infinite
         signals = np.concatenate(values, 1).astype(np.float32)
     return {'signal_names': tuple(names), 'signals': signals} if names else {}
 
 
-def _arrays(root: Any, skipped: Skipped, budget: Budget, numbers: dict[str, Any],
+def _arrays(root: Any, skipped: Skipped, budget: Budget,
+            numbers: dict[str, dict[str, Any]],
             ) -> Iterator[tuple[str, Callable[[], Iterable[Any]]]]:
-    """Yield the arrays of pictures in a file: their paths, and what reads them; note numbers."""
+    """Yield paths and readers of the arrays of pictures; note numbers by demonstration."""
     import h5py
     groups, seen, place = [('', root)], set(), escaped(Path(root.filename).name)
     while groups:
@@ -161,7 +163,7 @@ def _arrays(root: Any, skipped: Skipped, budget: Budget, numbers: dict[str, Any]
                 elif isinstance(one, h5py.Dataset) and _holds_pictures(one, budget):
                     yield path, partial(_read, one, budget)
                 elif isinstance(one, h5py.Dataset) and _holds_numbers(one):
-                    numbers[path] = one
+                    numbers.setdefault(_demonstration(path), {})[path] = one
 
 
 def _read(array: Any, budget: Budget) -> Iterable[Any]:
