@@ -510,6 +510,10 @@ def test_marks_that_are_none_are_told_in_a_line(content, tmp_path):
 @pytest.mark.parametrize('values', [
     pyarrow.ListArray.from_arrays(pyarrow.array([0, 10**8], pyarrow.int32()),
                                   pyarrow.nulls(10**8, pyarrow.int8())),
+    pyarrow.ListArray.from_arrays(pyarrow.array([0, 10**8], pyarrow.int32()),
+                                  pyarrow.nulls(10**8)),
+    pyarrow.ListArray.from_arrays(pyarrow.array([0, 10**8], pyarrow.int32()),
+                                  pyarrow.nulls(10**8, pyarrow.bool_())),
     pyarrow.DictionaryArray.from_arrays(np.zeros(1, np.int32), [bytes(2**20)])])
 def test_a_row_of_more_than_numbers_and_names_is_not_unpacked(values, tmp_path, run):
     folder = lerobot(tmp_path / 'set')
