@@ -28,6 +28,7 @@ from tap_ros.base.errors import ConfigError, RecordingError, StorageError
 from tap_ros.recording import mcap_file
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats.lerobot_subtasks import Ends, write_subtasks
+from tap_ros.recording.formats.tfrecord import _missing
 from tap_ros.recording.marks import read_marks
 from tap_ros.recording.metadata import FILE_NAME, from_yaml
 from tap_ros.recording.trust import Budget, inside
@@ -309,6 +310,21 @@ def test_an_array_has_its_values_in_its_own_file(spoil, tmp_path, run):
     assert len(frames) == 1 and (frames[0] == 77).all() and 'b.h5' in said
 
 
+def test_numbers_that_are_damaged_cost_no_picture_and_are_named(tmp_path, run):
+    file = hdf5(tmp_path / 'a.h5', **{
+        f'data/demo_{k}/{name}': values for k in range(2) for name, values in (
+            ('top', np.stack(2 * [PICTURE])), ('good', np.ones((2, 3))))})
+    with h5py.File(file, 'a') as opened:
+        plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plist.set_chunk((2, 3))
+        plist.set_filter(32001, h5py.h5z.FLAG_OPTIONAL, ())
+        h5py.h5d.create(
+            opened['data/demo_1'].id, b'bad', h5py.h5t.IEEE_F64LE, h5py.h5s.create_simple((2, 3)),
+            plist).write_direct_chunk((0, 0), bytes(48))
+    frames, said = run('import-arrays', file)
+    assert len(frames) == 2 and 'demo_1/bad of a.h5' in said and 'demo_1/top' not in said
+
+
 def test_links_that_lead_nowhere_and_in_circles_leave_a_file_usable(tmp_path, run):
     file = hdf5(tmp_path / 'a.h5', **{'data/demo_0/top': np.stack(2 * [PICTURE])})
     with h5py.File(file, 'a') as opened:
@@ -353,6 +369,12 @@ def test_lengths_of_records_are_not_believed_and_shards_are_counted(tmp_path, ru
     os.mkfifo(folder / '5.tfrecord')
     frames, said = run('import-tfrecord', folder)
     assert len(frames) == 6 and '00000-of-00003' in said and '00002-of-00003: it is empty' in said
+    for number in range(20):
+        (folder / f'c{number}.tfrecord-00000-of-99999').write_bytes(good)
+    told = sorted(_missing(folder.iterdir()))
+    assert len(told) == 21 and told[1] == (
+        'c0.tfrecord-00001-of-99999, c0.tfrecord-00002-of-99999, c0.tfrecord-00003-of-99999 and '
+        '99995 more')
 
 
 def bomb(path, content, count, compression=CompressionType.ZSTD):
@@ -488,6 +510,10 @@ def test_marks_that_are_none_are_told_in_a_line(content, tmp_path):
 @pytest.mark.parametrize('values', [
     pyarrow.ListArray.from_arrays(pyarrow.array([0, 10**8], pyarrow.int32()),
                                   pyarrow.nulls(10**8, pyarrow.int8())),
+    pyarrow.ListArray.from_arrays(pyarrow.array([0, 10**8], pyarrow.int32()),
+                                  pyarrow.nulls(10**8)),
+    pyarrow.ListArray.from_arrays(pyarrow.array([0, 10**8], pyarrow.int32()),
+                                  pyarrow.nulls(10**8, pyarrow.bool_())),
     pyarrow.DictionaryArray.from_arrays(np.zeros(1, np.int32), [bytes(2**20)])])
 def test_a_row_of_more_than_numbers_and_names_is_not_unpacked(values, tmp_path, run):
     folder = lerobot(tmp_path / 'set')

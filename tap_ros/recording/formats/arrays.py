@@ -67,7 +67,8 @@ def run(args: Options) -> None:
                 if why := (what_is if file.name.endswith('.zarr.zip') else what_else)(file):
                     raise RecordingError(why)
                 with h5py.File(file, 'r') as root:
-                    budget, beside = Budget(file.stat().st_size), dict[str, Any]()
+                    budget, beside = Budget(
+                        file.stat().st_size), dict[str, dict[str, Any]]()
                     arrays = dict(_arrays(root, skipped, budget, beside))
                     for name, number in zip(_chosen(arrays, args.camera), numbers):
                         with skipped.errors_of('array', f'{escaped(name)} of {place}'):
@@ -77,8 +78,9 @@ def run(args: Options) -> None:
                                 at_rate(found, args.rate),
                                 lambda each: args.cut.image(_picture(each)), skipped,
                                 f'episode {number}')
-                            signals = _signals(name, beside, np.rint(times * (
-                                args.fps or FPS)).astype(int), budget)
+                            signals = _signals(
+                                beside.get(_demonstration(name), {}),
+                                np.rint(times * (args.fps or FPS)).astype(int), budget, skipped)
                             yield make_episode(frames, times, task=args.task, seed=number,
                                                **signals)
 
@@ -115,29 +117,31 @@ def _demonstration(name: str) -> str:
     return '/'.join([*groups[:last], ''])
 
 
-def _signals(name: str, numbers: Mapping[str, Any], rows: np.ndarray,
-             budget: Budget) -> dict[str, Any]:
+def _signals(numbers: Mapping[str, Any], rows: np.ndarray, budget: Budget,
+             skipped: Skipped) -> dict[str, Any]:
     """
     Return the fields of an Episode with the numbers beside an array of pictures.
 
-    :param name: of the array of pictures.
-    :param numbers: arrays of numbers by their paths.
+    :param numbers: arrays of numbers of the demonstration by their paths.
     :param rows: (T,), of the pictures that are taken.
     """
-    place, found, left = _demonstration(name), dict[str, np.ndarray](), MOST_SIGNALS
-    for path in sorted(numbers):
-        array = numbers[path]
+    found, left = dict[str, np.ndarray](), MOST_SIGNALS
+    for path, array in sorted(numbers.items()):
         width = math.prod(array.shape[1:])
-        if _demonstration(path) == place and len(array) > rows.max() and width <= left:
-            budget.take(array.nbytes)
-            left -= width
-            found[path.removeprefix(place)] = array[:].reshape(len(array), width)[rows]
+        if len(array) > rows.max() and width <= left:
+            with skipped.errors_of(
+                    'array', f'{escaped(path)} of {escaped(Path(array.file.filename).name)}'):
+                budget.take(array.nbytes)
+                found[path.removeprefix(_demonstration(path))] = array[:].reshape(
+                    len(array), width)[rows]
+                left -= width
     return signal_fields(found)
 
 
-def _arrays(root: Any, skipped: Skipped, budget: Budget, numbers: dict[str, Any],
+def _arrays(root: Any, skipped: Skipped, budget: Budget,
+            numbers: dict[str, dict[str, Any]],
             ) -> Iterator[tuple[str, Callable[[], Iterable[Any]]]]:
-    """Yield the arrays of pictures in a file: their paths, and what reads them; note numbers."""
+    """Yield paths and readers of the arrays of pictures; note numbers by demonstration."""
     import h5py
     groups, seen, place = [('', root)], set(), escaped(Path(root.filename).name)
     while groups:
@@ -156,7 +160,7 @@ def _arrays(root: Any, skipped: Skipped, budget: Budget, numbers: dict[str, Any]
                 elif isinstance(one, h5py.Dataset) and _holds_pictures(one, budget):
                     yield path, partial(_read, one, budget)
                 elif isinstance(one, h5py.Dataset) and _holds_numbers(one):
-                    numbers[path] = one
+                    numbers.setdefault(_demonstration(path), {})[path] = one
 
 
 def _read(array: Any, budget: Budget) -> Iterable[Any]:

@@ -93,10 +93,18 @@ def listed(values: Any) -> list[Any]:
 
     :raises ValueError: for more than descriptions and numbers have.
     """
-    if values.nbytes > MOST_BYTES or 'dictionary' in str(
+    if max(values.nbytes, _count(values)) > MOST_BYTES or 'dictionary' in str(
             getattr(values, 'schema', None) or values.type):  # whose values repeat
         raise ValueError('its columns hold more than numbers and names')
     return list(values.to_pylist())
+
+
+def _count(values: Any) -> int:
+    """Return how many values there are at any depth; nulls in lists take no bytes."""
+    if hasattr(values, 'schema') or hasattr(values, 'chunks'):
+        return sum(map(_count, values.columns if hasattr(values, 'schema') else values.chunks))
+    inner = values.flatten() if hasattr(values, 'flatten') else []
+    return len(values) + sum(map(_count, inner if isinstance(inner, list) else [inner]))
 
 
 def read_parquet(folder: Path, name: Path) -> Any:

@@ -11,7 +11,7 @@ the instruction and, as signals, floats are taken; times are nominal, as records
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from itertools import count
+from itertools import count, islice
 import math
 import os
 from pathlib import Path
@@ -86,15 +86,18 @@ def run(args: Options) -> None:
         print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
 
 
-def _missing(files: Iterable[Path]) -> list[str]:
-    """Return the names of files that belong beside those of a folder: NAME-00003-of-00008."""
+def _missing(files: Iterable[Path]) -> Iterator[str]:
+    """Yield what belongs beside the files of a folder, NAME-00003-of-00008, a line a set."""
     found: dict[tuple[str, str], set[int]] = {}
     for file in files:
         if match := re.fullmatch(r'(.+)-(\d{5})-of-(\d{5})', str(file)):
             found.setdefault((match[1], match[3]), set()).add(int(match[2]))
-    return [f'{escaped(Path(name).name)}-{number:05d}-of-{total}'
-            for (name, total), numbers in found.items()
-            for number in range(int(total)) if number not in numbers]
+    for (name, total), numbers in found.items():
+        first = list(islice((k for k in range(int(total)) if k not in numbers), 3))
+        more = int(total) - sum(k < int(total) for k in numbers) - len(first)
+        if first:
+            yield ', '.join(f'{escaped(Path(name).name)}-{k:05d}-of-{total}' for k in first) + (
+                f' and {more} more' if more else '')
 
 
 def _choose(features: dict[str, list[bytes]], camera: str) -> str:
