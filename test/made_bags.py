@@ -14,8 +14,8 @@ from mcap.writer import Writer
 import numpy as np
 from tap_ros.base.contract import GRIPPER_JOINTS
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.file_writer import BagWriter
 from tap_ros.recording.messages import encode, schema_text
-from tap_ros.recording.writer import BagWriter
 
 IMAGE = 'sensor_msgs/msg/Image'
 OBJECTS = 'tap_msgs/msg/ObjectStates'

@@ -21,8 +21,9 @@ import numpy as np
 from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE, TOPICS
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.file_writer import BagWriter
 from tap_ros.recording.messages import encode, typestore
-from tap_ros.recording.writer import BagWriter, EpisodeWriter
+from tap_ros.recording.writer import EpisodeWriter
 
 DECODED = frozenset(topic.recorded for topic in TOPICS if topic.becomes)
 JPEG_FRAMES, JPEG_SIZE, JPEG_AIM_S = 1300, (192, 320), 10  # of a bag of another camera

@@ -8,7 +8,11 @@ its `becomes` is a group of columns, see recording/columns.py.
 """
 
 from dataclasses import dataclass
+import re
 from typing import Any
+
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.text import escaped
 
 IMAGE_TYPE, COMPRESSED_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 
@@ -82,6 +86,20 @@ TOPICS = (
     Topic('plan/distance', 'std_msgs/msg/Float64'), *MODEL_CARDS)
 BY_NAME = {topic.name: topic for topic in TOPICS}
 BY_COLUMNS = {topic.becomes: topic for topic in TOPICS if topic.becomes}
+
+
+def camera_view(name: str) -> Topic:
+    """
+    Return the topic of another camera that saw the same; nothing takes it for IMAGE.
+
+    :param name: letters, digits and underscores, such as wrist.
+    :raises ConfigError: for another name, and for IMAGE's own.
+    """
+    topic = Topic(f'camera/{name}/image_raw', IMAGE_TYPE)
+    if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name) or IMAGE.is_called(topic.recorded):
+        raise ConfigError(f'{escaped(name, 60)!r} is no name of another camera; expected one such '
+                          'as wrist: letters, digits and underscores, and not camera')
+    return topic
 
 
 @dataclass(frozen=True)

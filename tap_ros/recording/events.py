@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tap_ros.messages.stamps import stamp_fields
+from tap_ros.recording.file_writer import new_file
 from tap_ros.recording.messages import encode
-from tap_ros.recording.writer import new_file
 
 MOMENTS, SUBTASK = '/labels', '/labels/subtask'  # topics
 _LOG, _TEXT = 'rcl_interfaces/msg/Log', 'std_msgs/msg/String'

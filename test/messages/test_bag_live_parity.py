@@ -27,8 +27,8 @@ from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.predictor.requests import RequestReader
 from tap_ros.prediction.fullsize import fit
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.file_writer import BagWriter
 from tap_ros.recording.reading import Reading
-from tap_ros.recording.writer import BagWriter
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 from tap_ros.ros.topics import encode_image, encode_mask, encode_objects, LATCHED, STREAM, to_stamp
 

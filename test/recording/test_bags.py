@@ -48,7 +48,7 @@ KILLED = """
 import sys, time
 import numpy as np
 from tap_ros.recording.messages import encode
-from tap_ros.recording.writer import BagWriter
+from tap_ros.recording.file_writer import BagWriter
 writer = BagWriter(sys.argv[1])
 for t in range(10**6):
     stamp = {'sec': t + 1, 'nanosec': 0}

@@ -13,8 +13,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 import pytest
 from tap_ros.base.errors import RecordingError, RecordingWarning
-from tap_ros.recording import mcap_file
-from tap_ros.recording import writer as writer_module
+from tap_ros.recording import file_writer, mcap_file
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.writer import EpisodeWriter
 import zstandard
@@ -26,7 +25,7 @@ CHUNK, MESSAGE_INDEX, DATA_END = 6, 7, 15
 @pytest.fixture
 def chunked(tmp_path, monkeypatch):
     """Write episodes into a file of many chunks, most of which span several."""
-    monkeypatch.setattr(writer_module, 'CHUNK_BYTES', 3000)
+    monkeypatch.setattr(file_writer, 'CHUNK_BYTES', 3000)
     episodes = [make_episode(i, T=4 + i % 3, start=(i + 1) * 10**10) for i in range(9)]
     with EpisodeWriter(tmp_path / 'a.mcap') as writer:
         for episode in episodes:

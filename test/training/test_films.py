@@ -5,13 +5,14 @@
 import json
 
 from made_bags import camera, joints, record
+from made_lerobot import write_set
 import numpy as np
 import pytest
 from tap_ros.__main__ import main
 from tap_ros.apps.label_command import describe_all
 from tap_ros.base.errors import ConfigError
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.marks import write_marks
+from tap_ros.recording.marks import beside, write_marks
 from tap_ros.recording.reading import Reading
 from test_labels import COUNT, found, MARKED, two_moves
 
@@ -76,3 +77,40 @@ def test_the_command_takes_several_cameras_of_a_demonstration(bag, shown, tmp_pa
     rows = json.loads((tmp_path / 'out/labels.json').read_text())['labels']
     assert len(rows) == 2 * COUNT  # one of each demonstration, not of each camera
     assert rows[-1]['seconds'] == pytest.approx(shown[-1][2][1], abs=0.4)
+
+
+def test_cameras_that_were_imported_together_tell_of_one_demonstration(shown, tmp_path, capsys):
+    """The second move is seen by the wrist alone."""
+    episodes = []
+    for frames, _, _ in shown:
+        upper, lower = frames.copy(), frames.copy()
+        upper[:, 16:], lower[:, :16] = 40, 40
+        episodes.append({'observation.images.head': upper, 'observation.images.wrist': lower})
+    folder, bag = write_set(tmp_path / 'set', episodes), tmp_path / 'bag'
+    assert main(['import-lerobot', str(folder), '--out', str(bag), '--camera',
+                 'observation.images.head', '--camera', 'observation.images.wrist']) == 0
+    store = open_recordings([bag], progress=False)  # of the first camera, unasked
+    assert store.cameras == ['/camera/image_raw'] and len(store) == COUNT
+    write_marks(beside(bag), store, [bag], {i: [
+        (int(t), int(t)) for t in np.rint(10 * shown[i][2])] for i in range(MARKED)}, ['a', 'b'])
+
+    def away(*topics):
+        """Return how far off the label of the second move is, of those not marked, s."""
+        assert main(['label', str(bag), '--out', str(tmp_path / 'out'), *(
+            word for topic in topics for word in ('--image-topic', topic))]) == 0
+        rows = json.loads((tmp_path / 'out/labels.json').read_text())['labels']
+        assert len(rows) == 2 * COUNT
+        return np.median([abs(row['seconds'] - one[2][1])
+                          for row, one in list(zip(rows[1::2], shown, strict=True))[MARKED:]])
+    assert away() > 0.15
+    assert away('/camera/image_raw', '/camera/wrist/image_raw') < 0.1
+    cut = ['--crop', 'centre', '--size', '64']
+    assert main(['inspect', str(bag), *cut]) == 0
+    said = capsys.readouterr().out
+    assert '/camera/wrist/image_raw  sensor_msgs/msg/Image' in said
+    assert 'camera      /camera/image_raw\n' in said
+    weights = tmp_path / 'run/predictor.safetensors'
+    assert main(['train', 'predictor', str(bag), '--recipe', 'debug', '--steps', '2', *cut,
+                 '--test-fraction', '0.3', '--out', str(weights.parent)]) == 0
+    assert main(['evaluate', 'prediction', '--recordings', str(bag), '--weights',
+                 str(weights)]) == 0

@@ -16,8 +16,8 @@ from tap_ros.base.errors import ConfigError, RecordingError, StorageError
 from tap_ros.base.files import free_folder
 from tap_ros.base.text import escaped
 from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
+from tap_ros.recording.file_writer import BagWriter
 from tap_ros.recording.metadata import ArmMount, write_mount
-from tap_ros.recording.writer import BagWriter
 from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.parameters import declared_mount, Parameters, setting

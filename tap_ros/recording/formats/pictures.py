@@ -31,7 +31,7 @@ from tap_ros.recording.formats.videos import at_rate, video_frames
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading import Part
 from tap_ros.recording.trust import inside, MOST_BYTES, MOST_FRAMES, regular
-from tap_ros.recording.writer import EpisodeWriter, write_metadata
+from tap_ros.recording.writer import EpisodeWriter, Views, write_metadata
 from tqdm import tqdm
 from tyro import conf
 
@@ -268,13 +268,13 @@ def _is_free(folder: Path) -> bool:
                         and any(one.suffix == '.part' for one in left))
 
 
-def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
-              count: int | None = None, jpeg: bool = False) -> str:
+def write_bag(target: Target, episodes: Iterable[Episode | tuple[Episode, Views]],
+              skipped: Skipped, count: int | None = None, jpeg: bool = False) -> str:
     """
     Write episodes one after the other, in files of EPISODES_PER_FILE: all of them, or nothing.
 
     :param target: Target.
-    :param episodes: iterable of Episode, whose stamps count from anywhere.
+    :param episodes: iterable of Episode, whose stamps count from anywhere, alone or with Views.
     :param skipped: what could not be used of them, when they have been read.
     :param count: how many there are, to show progress.
     :param jpeg: keep pictures as JPEG, a sixth of the bytes and the time; of videos, which have
@@ -292,13 +292,14 @@ def write_bag(target: Target, episodes: Iterable[Episode], skipped: Skipped,
             for old in out.iterdir():
                 old.unlink()  # of an import that was killed
             with ExitStack() as stack:
-                for episode in tqdm(episodes, 'importing', count, unit='episode', delay=1):
+                for each in tqdm(episodes, 'importing', count, unit='episode', delay=1):
+                    episode, views = each if isinstance(each, tuple) else (each, None)
                     if done % EPISODES_PER_FILE == 0:
                         stack.close()
                         name = f'{out.resolve().name}_{done // EPISODES_PER_FILE}.mcap'
                         writer = stack.enter_context(EpisodeWriter(out / name, jpeg=jpeg))
                     stamps = episode.stamps - episode.stamps[0] + begin
-                    writer.write(replace(episode, stamps=stamps))
+                    writer.write(replace(episode, stamps=stamps), views)
                     begin, size = int(stamps[-1]) + EPISODE_SPACING_NS, episode.frames.shape[1:3]
                     frames, done = frames + len(episode), done + 1
             skipped.warn(out, is_empty=not done)
