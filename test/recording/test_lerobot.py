@@ -20,6 +20,7 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats import lerobot_export
 from tap_ros.recording.formats.lerobot_format import ACTION, CAMERA, OBJECTS, STATE
 from tap_ros.recording.marks import beside, read_marks, write_marks
+from tap_ros.recording.reading import Reading
 
 
 @pytest.fixture(scope='module')
@@ -221,3 +222,27 @@ def test_frames_are_those_of_the_rows_times_and_of_one_episode_each(
     seen = np.concatenate([e.frames.mean((1, 2, 3)) for e in open_recordings(tmp_path / 'bag')])
     assert np.abs(seen - 15 * np.arange(16)).max() < 5
     assert any('within the one before' in str(each.message) for each in recwarn) == (second < 2)
+
+
+def test_each_camera_of_version_3_has_videos_of_its_own(filmed, tmp_path):
+    folder, key = filmed
+    other = key.replace('top', 'side')
+    path, videos = folder / 'meta/info.json', folder / 'videos'
+    info = json.loads(path.read_text())
+    info['features'][other] = info['features'][key]
+    path.write_text(json.dumps(info))
+    shutil.copytree(videos / key, videos / other)
+    shutil.copy(videos / key / 'chunk-000/file-000.mp4', videos / other / 'chunk-000/file-001.mp4')
+
+    def add(table):
+        for name, values in (('chunk_index', [0, 0]), ('file_index', [1, 0]),
+                             ('from_timestamp', [2.0, 0.0])):
+            table = table.append_column(f'videos/{other}/{name}', pyarrow.array(values))
+        return table
+    rewrite(folder, 'meta/episodes', add)
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag'), '--camera', key,
+                 '--camera', other]) == 0
+    for topic, rows in (('', np.arange(16)), ('/camera/side/image_raw', np.arange(16) ^ 8)):
+        seen = np.concatenate([e.frames.mean((1, 2, 3)) for e in open_recordings(
+            tmp_path / 'bag', reading=Reading(topic))])
+        assert np.abs(seen - 15 * rows).max() < 5

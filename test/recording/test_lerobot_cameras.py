@@ -13,6 +13,7 @@ from tap_ros.__main__ import main
 from tap_ros.base.errors import ConfigError
 from tap_ros.recording.bags import list_topics
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.formats import lerobot_camera
 from tap_ros.recording.formats.lerobot_camera import view_names
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import EpisodeWriter
@@ -106,6 +107,15 @@ def test_what_another_camera_lacks_costs_nothing_else(episodes, tmp_path, run):
     assert code == 0 and f'view episode 1 of {WRIST}: ' in said and 'is not there' in said
     assert f'view episode 2 of {WRIST}: ' in said and 'is no video' in said
     assert list(map(len, frames(bag))) == 3 * [T] and len(frames(bag, TOPIC)) == 1
+
+
+def test_the_pictures_of_another_camera_have_an_end(episodes, tmp_path, run, monkeypatch):
+    monkeypatch.setattr(lerobot_camera, 'MOST_BYTES', 3 * 32 * 40 * 3)
+    code, bag, said = run(write_set(tmp_path / 'set', episodes), HEAD, WRIST)
+    assert code == 0 and f'{TOPIC}: 9 pictures' in said
+    assert '3 views: it has more than 0 GiB; keep less of each picture' in said
+    assert list(map(len, frames(bag))) == 3 * [T]
+    assert list(map(len, frames(bag, TOPIC))) == 3 * [3]
 
 
 def test_a_picture_that_the_first_camera_lacks_is_left_out_of_all(episodes, tmp_path, run):

@@ -73,8 +73,8 @@ class Options(Target):
 
     :param path: folder of the data set, with meta/info.json.
     :param camera: feature whose pictures are taken; needed where the set has several of colour.
-        Of several the first is the predictor's, on /camera/image_raw; each other one is kept for
-        label, on a topic such as /camera/wrist/image_raw.
+        Given several times, the first is the predictor's, on /camera/image_raw; each other one is
+        kept for label, on a topic such as /camera/wrist/image_raw.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]

@@ -18,7 +18,7 @@ from tap_ros.images.encodings import decompress
 from tap_ros.recording.formats.lerobot_format import listed, Video
 from tap_ros.recording.formats.pictures import Skipped
 from tap_ros.recording.formats.videos import video_frames
-from tap_ros.recording.trust import inside, read_bytes
+from tap_ros.recording.trust import inside, MOST_BYTES, read_bytes
 
 Row = dict[str, Any]  # of meta/episodes
 
@@ -103,7 +103,7 @@ class Camera:
         :param row, part: as `cells` takes them.
         :param kept: which rows of the part.
         """
-        place = f'episode {self._named(row)}'
+        place, size = f'episode {self._named(row)}', 0
         if self._path_of and row['episode_index'] not in self._starts:
             return  # of which find_starts told
         with skipped.errors_of('view', place):
@@ -112,7 +112,11 @@ class Camera:
                 picture = None
                 with skipped.errors_of('picture', f'{k} of {place}'):
                     picture = crop.image(show(cells[k]))
-                    self.count += 1
+                    size += picture.nbytes
+                if size > MOST_BYTES:
+                    raise RecordingError(f'it has more than {MOST_BYTES >> 30} GiB; keep less of '
+                                         'each picture (--size)')
+                self.count += picture is not None
                 yield picture
 
     def _named(self, row: Row) -> str:
