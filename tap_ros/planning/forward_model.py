@@ -250,12 +250,12 @@ class LearnedForwardModel(nn.Module):
         return cells.view_as(flow), following, masks
 
     def rollout(self, features: torch.Tensor, gripper: torch.Tensor,
-                actions: torch.Tensor) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        """Yield flow and masks, see advance, after each of actions (N, T, 4) from (N, 4)."""
+                actions: torch.Tensor) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Yield what advance returns after each of actions (N, T, 4) from (N, 4)."""
         flow = self.still(len(actions))
         for action in actions.unbind(1):
             flow, gripper, masks = self.advance(features, flow, gripper, action)
-            yield flow, masks
+            yield flow, gripper, masks
 
     def _window(self, gripper: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the cells (N, 1, m m) near the gripper, row-major, and points (N, 2, m, m)."""

@@ -153,7 +153,7 @@ def sample_grid(model: LearnedForwardModel, store: Episodes,
     columns = [list(to_uint8(batch.images[:, 0])), grey_panels(scene.objects[:, 3].cpu()),
                list(to_uint8(scene.background))]
     steps = model.rollout(scene.features, batch.grippers[:, 0], batch.actions)
-    for t, (flow, _) in enumerate(steps, start=1):
+    for t, (flow, *_) in enumerate(steps, start=1):
         if t in (HORIZON // 3, 2 * HORIZON // 3, HORIZON):
             predicted, _ = model.picture(scene, flow, model.draw_arm(batch.grippers[:, t]))
             columns += [list(to_uint8(batch.images[:, t])), list(to_uint8(predicted))]

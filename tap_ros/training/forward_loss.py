@@ -168,7 +168,7 @@ def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Coll
     scene = model.look(first, arms[:, 3:].detach(), batch.homography)
     pictures = moving = first.new_zeros(())
     steps = model.rollout(scene.features, batch.grippers[:, 0], batch.actions)
-    for t, (flow, masks) in enumerate(steps, start=1):
+    for t, (flow, _, masks) in enumerate(steps, start=1):
         moving = moving + (1 - masks[:, 2]).mean()
         if t in picture_steps:
             arm = draw_arm_like(model, batch, t)

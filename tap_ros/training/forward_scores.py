@@ -110,7 +110,7 @@ def measure_pictures(model: LearnedForwardModel, store: 'Episodes',
         first, gripper = windows.images[:, 0], windows.grippers[:, 0]
         scene, rows = model.look(first, model.draw_arm(gripper)[:, 3:]), []
         ahead = model.rollout(scene.features, gripper, windows.actions)
-        for t, (flow, _) in enumerate(ahead, start=1):
+        for t, (flow, gripper, _) in enumerate(ahead, start=1):
             if t in steps:
                 seen = windows.images[:, t]
                 counts = ~windows.hidden[:, t, 0]
