@@ -215,26 +215,22 @@ def average(rows):
 
 def page(rows):
     """Write the page of the results, a line for each task."""
-    lengths, (tables, seeds, found) = {}, (
-        {kind: {} for kind in ('keyframes', 'trained', 'aside')} for _ in range(3))
+    lengths, (tables, found) = {}, (
+        {kind: {} for kind in ('keyframes', 'labelled', 'without', 'aside')} for _ in range(2))
     for row in rows:
         task, method, hit, near = (row[name] for name in ('task', 'method', 'hit', 'near'))
-        kind = ('aside' if task.startswith('aside/') else
-                'trained' if 'seeds' in row else 'keyframes')
-        if 'seeds' in row:
-            seeds[kind][method] = min(row['seeds'], seeds[kind].get(method, row['seeds']))
-        else:
+        kind = ('aside' if task.startswith('aside/') else 'keyframes' if 'seeds' not in row else
+                'labelled' if method in WITH_MARKS else 'without')
+        if 'seeds' not in row:
             lengths[task] = f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f}"
         line = tables[kind].setdefault(task, {
             'task': task.removeprefix('aside/').replace('/', ' '), FRAMES: lengths[task]})
         line[method] = f"{hit['value']:.0%}, {near['value']:.0%}" + (
-            f"; {row['error']['value']:.2f}" if method in WITH_MARKS and 'error' in row else '')
+            f"; {row['error']['value']:.2f}" if 'error' in row else '')
         found[kind].setdefault(method, []).append(
             any(value['value'] >= least for value, least in zip((hit, near), FOUND)))
     for kind, lines in tables.items():
         lines['found'] = {'task': '**found**', FRAMES: ''} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
-    return render('worlds/templates/worlds.md.j2', marked=MARKED, seeds=seeds['trained'],
-                  held_out=max((row['n'] for row in rows if 'seeds' in row), default=0),
-                  seeds_aside=seeds['aside'].get('marks'), **{
-                      kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})
+    return render('worlds/templates/worlds.md.j2', marked=MARKED, **{
+        kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})
