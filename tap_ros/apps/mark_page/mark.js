@@ -5,6 +5,7 @@
 const at = (id) => document.getElementById(id);
 const THUMBNAILS = 14;
 const ASK_AGAIN_MS = 1500;  // while labels are being found
+const BESIDE_S = 0.5;  // between a label and where the hand moves, which is taken for it
 let state = null;    // what the server knows
 let about = null;    // of the demonstration that is shown: seconds of its frames, moves of its gripper
 let episode = 0;     // which one is shown
@@ -25,21 +26,20 @@ const isSaved = () => String(draft) === String(state.marks[episode] || []);
 const given = () => draft.filter((t) => t !== null);
 const labels = () => state.marks[episode] ? [] : state.labels[episode] || [];
 
-// What the key a accepts: a frame for each name, where the gripper moves, else where the labels are.
+// What the key a accepts: a frame for each name, that of its label, or where the hand moves beside it; without labels where
+// the hand moves.
 function proposed() {
   const guess = labels().map(([t]) => t), moves = about.moves.map(([t]) => t);
   const first = Math.max(0, about.moves.findIndex(([, closes]) => closes));  // it closes before it opens
   const others = Object.values(state.marks).map((frames) => frames.length);
   const count = names().length || others[0] || guess.length || moves.length - first;
-  if (moves.length < count) return guess.length === count ? guess : moves;
-  if (guess.length !== count) return moves.slice(Math.min(first, moves.length - count)).slice(0, count);
-  const found = [];  // the moves nearest to the labels, in order
-  guess.forEach((wanted, k) => {
-    const left = moves.filter((t) => t > (found[k - 1] ?? -1));
-    const usable = left.slice(0, left.length - (count - 1 - k));
-    found.push(usable.reduce((a, b) => Math.abs(b - wanted) < Math.abs(a - wanted) ? b : a));
-  });
-  return found;
+  if (!guess.length || guess.length !== count) {
+    return moves.length < count ? moves : moves.slice(Math.min(first, moves.length - count)).slice(0, count);
+  }
+  const off = (t, wanted) => Math.abs(about.seconds[t] - about.seconds[wanted]);
+  const found = guess.map((wanted) => moves.filter((t) => off(t, wanted) <= BESIDE_S)
+    .sort((a, b) => off(a, wanted) - off(b, wanted))[0] ?? wanted);
+  return found.every((t, k) => !k || t > found[k - 1]) ? found : guess;
 }
 
 function show(t) {
