@@ -120,9 +120,8 @@ class Reaching:
     A goal that the planner pursues; iterate over it for feedback until it ends.
 
     A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px), planning_ms and
-    plan_samples.
-    Leaving the iteration, or dropping this object, cancels nothing: its client still owns the
-    goal, and cancels it when it is closed. A wait that fails or is interrupted cancels it.
+    plan_samples. Leaving the iteration, or dropping this object, cancels nothing: its client owns
+    the goal, and cancels it when it is closed. A wait that fails or is interrupted cancels it.
 
     :param goals: Goals of the node that sends it.
     :param goal: the action's goal.
@@ -248,10 +247,9 @@ class Reaching:
 
     def _sent(self, goal: ReachGoal.Goal, deadline: float, accept_s: float) -> ClientGoalHandle:
         """
-        Return the planner's answer to the goal.
+        Return the planner's answer to the goal; one whose answer is lost is sent anew.
 
-        An answer is lost when it leaves before the planner has discovered who waits for it. Then
-        the goal is cancelled, and sent anew under another id, by new endpoints.
+        An answer is lost when it leaves before the planner has discovered who waits for it.
         """
         server = self._server
         while True:
@@ -330,9 +328,9 @@ def watch_sender(node: Node, goal_id: bytes) -> Callable[[], bool]:
     """
     Return a function that tells whether who has sent a goal has left the ROS graph.
 
-    A Client of this package is known by the id. Of other programs it is known that they listen to
-    the feedback of their goals: none may be left of those that did when the goal was accepted.
-    Our own programs listen, too, but have not sent a goal whose id names none of them.
+    A Client of this package is known by the id. Other programs listen to the feedback of their
+    goals: none may be left of those that did when the goal was accepted. Our own programs listen,
+    too, but have not sent a goal whose id names none of them.
 
     :param node: that serves the goal; goal_id: its 16 bytes.
     """
