@@ -28,6 +28,7 @@ from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_fil
 from tap_ros.recording.bags import find_bags, reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.marks import Marks, read_marks
+from tap_ros.recording.reading import Reading
 from tap_ros.training.frames import FilledStore
 from tap_ros.training.split import split_as_trained, TEST_FRACTION, warn_if_few, with_masks
 from tap_ros.weights import PREDICTORS
@@ -78,7 +79,7 @@ def run(args: Options) -> None:
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
     network, training, crop = _load(args.weights)
-    store = _open(args, training, crop)
+    store, reading = _open(args, training, crop)
     robot_mask = trained_robot_mask(training)[0]
     learned, episodes = _split(store, training, args.all, robot_mask)
     marks = _read_marks(args.marks, store, episodes)
@@ -100,8 +101,10 @@ def run(args: Options) -> None:
                      'whether they were memorised')
     print('\n'.join(words))
 
-    answers = [] if filled else _answer_large(
-        network, training, store, episodes, args.goal_picture, scores['prediction'])
+    answers = []
+    if filled is None and _goals_are_frames(args, store, episodes):
+        answers = _answer_large(network, training, store, episodes, reading.crop,
+                                scores['prediction'])
     about: dict[str, Any] = {method: value.summary() | {'intervals': {
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
@@ -134,15 +137,17 @@ def _load(weights: str) -> tuple[PredictorNetwork | Predictor, dict[str, Any], T
     return network, training, trained_crop(training, (network.config.image_size,) * 2)
 
 
-def _open(args: Options, training: dict[str, Any], crop: TrainedCrop) -> EpisodeStore:
-    """Return the recordings, read as those of the training were."""
+def _open(args: Options, training: dict[str, Any],
+          crop: TrainedCrop) -> tuple[EpisodeStore, Reading]:
+    """Return the recordings, read as those of the training were, and how."""
     bags = find_bags(args.recordings)
-    store = open_recordings(bags, reading=reading_like(training, bags, args.image_topic, crop))
+    reading = reading_like(training, bags, args.image_topic, crop)
+    store = open_recordings(bags, reading=reading)
     if store.image_size != crop.size:
         raise ConfigError('{0}: made for {2}x{1} pixels (width x height), the recordings have '
                           '{4}x{3}; use matching ones'.format(
                               args.weights, *crop.size, *store.image_size))
-    return store
+    return store, reading
 
 
 def _split(store: EpisodeStore, training: dict[str, Any], everything: bool,
@@ -169,23 +174,25 @@ def _read_marks(path: str, store: EpisodeStore, episodes: np.ndarray) -> Marks |
     return marks
 
 
+def _goals_are_frames(args: Options, store: EpisodeStore, episodes: np.ndarray) -> bool:
+    """Return whether no goal is a picture of its own, which is kept at the network's size."""
+    return args.goal_picture == 'last' or all(store[i].goal_frame is None for i in episodes)
+
+
 def _answer_large(network: PredictorNetwork | Predictor, training: dict[str, Any],
-                  store: EpisodeStore, episodes: np.ndarray, goal_picture: str,
+                  store: EpisodeStore, episodes: np.ndarray, crop: str,
                   scores: EpisodeScores) -> list[Answer]:
     """
     Return answers to pictures as they were recorded, and print how good they are.
 
-    None where these are not larger; nor with z, or where goals are pictures of their own, which
-    are kept at the network's size.
+    :return: none where these are not larger, and of weights with z.
     """
-    if goal_picture == 'recorded' and any(store[i].goal_frame is not None for i in episodes):
-        return []
     if isinstance(network, PredictorNetwork):
         if network.config.latent_size:
             return []
         network = SubgoalPredictor(network, training)
     answers = answer_at_full_size(network, store, episodes[:_LARGE], scores.match_step[:_LARGE],
-                                  training.get('settings', {}).get('crop', ''))
+                                  crop)
     if answers:
         word, ratio = against_copying(*(np.array([getattr(one, name) for one in answers])
                                         for name in ('l1', 'copying')))

@@ -31,14 +31,15 @@ def answer_at_full_size(predictor: Predictor, store: EpisodeStore,
     """
     Ask a predictor about recorded pictures that are larger than it needs.
 
-    :param episodes: N indices; the goal is the last frame of each.
+    :param episodes: N indices, at least one; the goal is the last frame of each.
     :param matched: (N,) the frame of each that its prediction is compared with.
     :param part: of the pictures that is used, as Crop takes it.
     :return: N Answers; none where pictures are not larger, or the predictor takes no larger ones.
     """
     full, answers = FullSize(store, part), []
-    if not predictor.full_size or not len(episodes) or (
-            full.picture(int(episodes[0]), 0).shape[:2] <= predictor.image_size):
+    size = full.picture(int(episodes[0]), 0).shape[:2]
+    if size == predictor.image_size or not (
+            predictor.full_size and predictor.camera_crop.is_cut(size)):
         return []
     for i, t in zip(map(int, episodes), map(int, matched)):
         start, truth, goal = (full.picture(i, at) for at in (0, t, len(store.frames(i)) - 1))

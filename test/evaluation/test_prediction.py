@@ -22,6 +22,7 @@ from tap_ros.evaluation.hits import seconds_off
 from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
+from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
@@ -241,6 +242,7 @@ def test_answers_are_scored_at_the_size_that_was_recorded(tmp_path):
     store = open_recordings(bag, reading=Reading(size=SIZE), progress=False)
     remembers = SimpleNamespace(
         mode='bidirectional', full_size=True, image_size=(SIZE, SIZE),
+        camera_crop=TrainedCrop(Crop(), None, (SIZE, SIZE)),
         predict_together=lambda requests: [[SimpleNamespace(image=next(
             one.frames[4] for one in episodes if (one.frames[0] == request.start).all()))]
             for request in requests])
