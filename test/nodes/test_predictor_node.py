@@ -14,6 +14,7 @@ from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.subgoals import decode_subgoals
+from tap_ros.nodes.predictor import requests
 from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.predictor import SubgoalPredictor
@@ -200,6 +201,21 @@ def test_a_picture_whose_robot_mask_is_missing_is_refused(services):
         message = masked.ask(goal=GOAL).message
         return 'camera/robot_mask' in message and '2.500000000 s' in message
     assert until(refused)
+
+
+def test_a_request_right_after_the_start_waits_until_a_camera_is_found(
+        client, files, monkeypatch):
+    monkeypatch.setattr(requests, 'DISCOVERY_S', 60.0)
+    service = Service(client, 'early', weights=files['plain'])
+    try:
+        answer = service.client.call_async(PredictSubgoal.Request(goal=GOAL))
+        assert not until(answer.done, 0.1)
+        with Client('early_eye') as eye:
+            images = eye.create_publisher(Image, '/early/camera/image_raw', STREAM)
+            assert until(lambda: images.publish(START) or answer.done(), 60)
+        assert answer.result().success, answer.result().message
+    finally:
+        assert service.end() == 0
 
 
 def test_pictures_of_two_cameras_are_refused_unless_one_is_sent_along(services):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 import math
+import time
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -39,6 +40,7 @@ MAX_WAITING = 64  # requests
 # Fewer than a client's queue of 10: every client receives the answers of all, and takes its own.
 MAX_TOGETHER = 8  # requests in one batch
 MAX_ROWS = 64  # samples x objects in one batch, unless one request alone has more
+DISCOVERY_S = 3.0  # from the start of a node until it has found a camera that was there before
 OBJECTS_TIMEOUT = 0.1  # s that objects and mask of the newest picture may come after it
 
 
@@ -84,6 +86,7 @@ class RequestReader:
         self._node, self._robot = node, RobotView(params['robot_mask'])
         self._cameras = [topic for name, (_, topic) in camera_topics(params).items()
                          if name != 'objects']
+        self._discovered = time.monotonic() + DISCOVERY_S
         self._newest = {}
         for name, types, qos in (('start', camera_topics(params), STREAM),
                                  ('goal', goal_topics(params['robot_mask']), LATCHED)):
@@ -164,7 +167,7 @@ class RequestReader:
         newest, start = self._newest[name], name == 'start'
         if start and (cameras := rivals(publishers_of(self._node, *self._cameras))):
             raise ImageError(f'start: {cameras}; leave one of them, or send a picture along')
-        found = newest.newest('image')
+        found = newest.wait(['image'], self._discovered - time.monotonic())
         if found is None:
             raise ImageError(
                 f'{name}: the request has none and nothing has come on '
