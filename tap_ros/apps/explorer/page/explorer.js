@@ -34,7 +34,8 @@ function take(message) {
   if (message.kind === 'state') {
     const before = state;
     state = message;
-    if (before && before.scene !== state.scene) {
+    if (before?.scene !== state.scene) {
+      $('seed').value = state.seed ?? 7;
       step = '';
       select(false);
     }
@@ -93,7 +94,7 @@ function progress() {
     objects: [count > 0 && !anew, selecting() ? clicked : !count ? 'waits for objects'
       : unsure.length ? `not sure of ${unsure.join(', ')}` : tracker ? `${count} followed` : `${count} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
-      ? `waits for a goal: ${simulator ? 'start a scene' : 'photograph it'}`
+      ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
       : count && missing.length ? `drag ${missing.join(', ')} to its goal` : goal.pictured ? 'the picture is there' : 'placed by hand',
     camera_why],
     predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : predict_why || 'ready', predict_why],
