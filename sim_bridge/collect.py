@@ -26,10 +26,10 @@ from tap_ros.base.errors import check_fields, ConfigError, RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
 from tap_ros.base.options import Folder, one_of
 from tap_ros.base.plugins import names
+from tap_ros.base.progress import Progress
 from tap_ros.base.text import escaped
 from tap_ros.recording.writer import count_episodes, EpisodeWriter, write_metadata
 from tap_ros.robots.arm import DEFAULT_ARM
-from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
@@ -57,10 +57,9 @@ class CollectConfig:
         late, drawn for each episode.
     :param misses: share of the pushes that are at random, so that objects are hit, grazed and
         missed: what a forward model has to tell apart.
-    :param look: of the world, see looks.LOOKS.
-    :param appearance: of table, light and camera, see looks.CHOICES; 'random' is drawn anew for
-        every episode.
-    :param arm: name of an arm, see robots.arm.get_arm.
+    :param look: of the world: the whole arm at its table, or its hand alone.
+    :param appearance: of table, light and camera; 'random' is drawn anew for every episode.
+    :param arm: at the table.
     """
 
     world: Annotated[str, one_of(names('tap_ros.worlds'))] = TABLE
@@ -133,7 +132,7 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
         total = sum(len(_episodes(config, i)) for i in missing)
         tasks = [Work(_shard_path(folder, i).name, _collect_shard, (str(folder), config, i, make))
                  for i in missing]
-        with tqdm(total=total, unit='episode', disable=not progress) as bar:
+        with Progress(total=total, unit='episode', disable=not progress) as bar:
             for _, get in run_tasks(tasks, engine):
                 found = get()
                 _note_bottlenecks(folder, [row['mark'] for row in found if row['mark']])

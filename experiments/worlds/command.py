@@ -64,7 +64,7 @@ class Options:
     :param methods: that are trained on each task, beside keyframes, which need no training.
     :param seeds: trainings of each method.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
-    :param runs: folder of the trainings, likewise.
+    :param runs: folder of the trainings.
     :param out: folder for worlds.json, worlds.md and worlds.png.
     :param results_only: collect nothing.
     """

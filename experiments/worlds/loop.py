@@ -67,7 +67,7 @@ class Options:
     :param scenes: of each task; those are left out whose goal the script of the environment's
         authors does not bring about.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
-    :param runs: folder of the trainings and of the scenes that were run, likewise.
+    :param runs: folder of the trainings and of the scenes that were run.
     :param out: folder for worlds_loop.json, worlds_loop.md and worlds_loop.png.
     :param results_only: run no more scenes.
     """

@@ -72,7 +72,13 @@ class RigidTracker:
         self._gripper: np.ndarray | None = None
 
     def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray) -> Tracked:
-        """Follow other objects; see Tracker."""
+        """
+        Follow other objects, from this picture on.
+
+        :param pixels: (K, 2) (u, v), a click on each object.
+        :raises TrackingError: for a click outside the picture, on the robot, beyond the table, or
+            on nothing that differs from it; then those before are followed on.
+        """
         plane = Plane(self._camera, view.image.shape[:2])
         picture = Picture(view, plane)
         clicks = plane.shrink(np.reshape(pixels, (-1, 2)))
@@ -93,7 +99,7 @@ class RigidTracker:
         return self._tracked()
 
     def update(self, view: View) -> Tracked:
-        """Follow into the next picture; see Tracker."""
+        """Follow into the next picture; return where the K objects are in it."""
         if not self._objects:
             return self._tracked()
         picture = Picture(view, self._plane)
@@ -105,7 +111,7 @@ class RigidTracker:
         return self._tracked()
 
     def find(self, view: View) -> Tracked:
-        """Find the objects in another picture; see Tracker."""
+        """Find the objects in another picture; what is not found is LOST, and followed on."""
         return register(self._first, Picture(view, self._plane), self._plane,
                         [one.face for one in self._objects])
 

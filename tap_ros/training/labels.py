@@ -39,7 +39,7 @@ class Film:
     What the pictures of a demonstration show around each of its frames, at RATE at most.
 
     :param stamps: (T,) s.
-    :param features: (T, D) float64: FEATURES at the times AROUND_S, likewise of other cameras, and
+    :param features: (T, D) float64: FEATURES at the times AROUND_S, also of other cameras, and
         signals; then the small grey picture of each camera.
     :param grey: how many of the last columns are those of pictures.
     """

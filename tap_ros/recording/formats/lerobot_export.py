@@ -19,6 +19,7 @@ import numpy as np
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.files import storage_errors
 from tap_ros.base.options import Bags, File, Folder
+from tap_ros.base.progress import Progress
 from tap_ros.base.text import escaped
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
@@ -40,7 +41,6 @@ from tap_ros.recording.formats.lerobot_format import (
 from tap_ros.recording.marks import Mark, read_marks
 from tap_ros.recording.reading import reading_of, ReadingOptions
 from tap_ros.robots.arm import DEFAULT_ARM
-from tqdm import tqdm
 
 EPISODES_PER_FILE = 100
 FILES_PER_CHUNK = 1000
@@ -116,8 +116,8 @@ def export(store: EpisodeStore, folder: Path,
         names['subtask'], numbers[SUBTASK] = _subtasks(store, marks)
     features = _features(store, vectors)
     features |= {f'{key}_index': INDEX for key in names}
-    rows = list(tqdm(_write_files(store, folder, numbers), 'exporting', len(store),
-                     unit='episode', delay=1))
+    rows = list(Progress(_write_files(store, folder, numbers), 'exporting', len(store),
+                         unit='episode', delay=1))
     _write_meta(folder, features, names, rows, fps)
     _write_json(folder / 'meta/stats.json', {
         CAMERA: _picture_summary(store),
