@@ -59,6 +59,7 @@ NODE_CLASSES = {
     'tracker_node': 'tap_ros.nodes.tracker.node:TrackerNode',
     'explorer_node': 'tap_ros.apps.explorer.node:ExplorerNode',
 }
+OWNED = 'TAP_ROS_OWNED'  # environment variable of a node that ends when its standard input closes
 
 
 def step_budget(num_objects: int) -> int:

@@ -28,9 +28,10 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.ros.calls import call, CallError, Spinner
+from tap_ros.ros.goal_senders import CLIENT
 from tap_ros.ros.heartbeat import Liveness
 from tap_ros.ros.observations import Observations
-from tap_ros.ros.reaching import CANCEL, CLIENT, Goals, Reaching
+from tap_ros.ros.reaching import CANCEL, Goals, Reaching
 from tap_ros.ros.requests import (
     by_name,
     make_request,

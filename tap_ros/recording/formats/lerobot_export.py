@@ -57,7 +57,7 @@ class Options:
 
     :param recordings: bag folders, folders of bag folders, or .mcap files.
     :param out: folder of the data set; must not exist.
-    :param marks: file of marks (see `mark`); each ends a subtask.
+    :param marks: file of marks (see `mark`); with each the next subtask begins.
     """
 
     recordings: Bags
@@ -96,7 +96,7 @@ def export(store: EpisodeStore, folder: Path,
 
     :param store: EpisodeStore.
     :param folder: a new one.
-    :param marks: of episodes; the middle of each is the last frame of a subtask.
+    :param marks: of episodes; the middle of each is the first frame of the next subtask.
     :return: its features, as in info.json.
     :raises RecordingError: when frames lack what LeRobot needs.
     """
@@ -161,9 +161,9 @@ def _subtasks(store: EpisodeStore,
     names = [*(f'to mark {k + 1}' for k in range(most)), 'to the goal', 'not marked']
     found = []
     for i, T in enumerate(store.lengths.tolist()):
-        ends = [(first + last) // 2 for first, last in marks.get(i, ())]
-        passed = np.searchsorted(ends, np.arange(T))
-        passed[passed == len(ends)] = most if ends else most + 1
+        at = [(first + last) // 2 for first, last in marks.get(i, ())]
+        passed = np.searchsorted(at, np.arange(T), side='right')
+        passed[passed == len(at)] = most if at else most + 1
         found.append(passed)
     return {name: number for number, name in enumerate(names)}, np.concatenate(found)
 
