@@ -135,7 +135,7 @@ def test_requirements_and_constraints_agree():
     pinned = requirements('constraints.txt')
     for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-experiments.txt',
                  'requirements-extras.txt', 'requirements-worlds.txt', 'requirements-ros.txt',
-                 'requirements-ros2.txt'):
+                 'requirements-ros2.txt', 'requirements-docs.txt'):
         for distribution, version in requirements(name).items():
             assert pinned[distribution] == version, f'{name}: {distribution}'
 
