@@ -38,8 +38,9 @@ setup(
     python_requires='>=3.11',
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
     package_data={
-        NAME: ['*.pyi', 'apps/demo/*.html', 'apps/explorer/page/*', 'apps/mark_page/*', 'py.typed',
-               'ros/*.xml', 'weights/*.md', 'weights/*.png', 'weights/*.safetensors'],
+        NAME: ['*.pyi', 'apps/demo/*.html', 'apps/explorer/page/*', 'apps/mark_page/*',
+               'apps/shared_page/*', 'py.typed', 'ros/*.xml', 'weights/*.md', 'weights/*.png',
+               'weights/*.safetensors'],
         'sim_bridge': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

@@ -8,6 +8,7 @@ files do not depend on the number of workers. A finished file has its final name
 collection goes on with the files that are not there yet.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 import json
@@ -99,6 +100,9 @@ def run(args: Options) -> None:
           f"{result['seconds']['wall']:.0f} s; objects end "
           f"{100 * result['mean_final_distance']:.1f} cm from their goals on average, "
           f"{result['success_rate']:.0%} of the episodes succeed")
+    if known := result['bottlenecks']:
+        print(f'{BOTTLENECKS_FILE}: ' + ', '.join(
+            f'{why or "known"} in {count}' for why, count in known.most_common()))
 
 
 def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
@@ -113,8 +117,8 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
     :param make: makes a world with `demonstrate` of a task and an image size, in the place of that
         which is named; the name only tells its recordings from others.
     :return: dict of episodes, frames, seconds (wall, and of acting and writing, summed over
-        workers), success rate, mean final distance in metres, of the episodes collected by this
-        call.
+        workers), success rate, mean final distance in metres, bottlenecks (Counter of why they
+        are not known, '' of those that are), of the episodes collected by this call.
     :raises ConfigError: when the folder holds a recording made with other settings.
     :raises EngineError: when worker processes are killed again and again.
     :raises StorageError: when the disk is full, or another process is collecting there. Files
@@ -145,7 +149,8 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
     return {
         'episodes': len(rows), 'frames': sum(row['frames'] for row in rows), 'seconds': seconds,
         'success_rate': float(np.mean([row['success'] for row in rows] or nan)),
-        'mean_final_distance': float(np.mean(distances or nan))}
+        'mean_final_distance': float(np.mean(distances or nan)),
+        'bottlenecks': Counter(row['unknown'] for row in rows if row['mark'] or row['unknown'])}
 
 
 def _check(config: CollectConfig, make: Make | None) -> None:
@@ -235,7 +240,8 @@ def _collect_shard(folder: str, config: CollectConfig, shard: int,
                 'recording': '.', 'episode': i,
                 'stamps': [[float(stamps[t]) / 1e9 for t in found.bottleneck]]}
             rows.append({
-                'frames': len(stamps), 'success': found.episode.outcome == 'success', 'mark': mark,
+                'frames': len(stamps), 'success': found.episode.outcome == 'success',
+                'mark': mark, 'unknown': found.unknown,
                 'distances': world.distances().tolist(), 'act': times[1] - times[0],
                 'write': times[2] - times[1]})
     world.close()

@@ -16,6 +16,7 @@ import numpy as np
 from sim_bridge.demonstrations import demonstrate, Demonstration
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera, Renderer
+from sim_bridge.world.gap import Gap
 from tap_ros.base.contract import (
     CONTROL_PERIOD,
     ROBOT_MASK_ARM,
@@ -64,7 +65,7 @@ class MetaWorld(GymWorld):
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # the goal is drawn as a site
         self._labels = _labels(model)
-        self._movable = _movable(model)
+        self._movable, self._gap = _movable(model), Gap(model, 'base')
         self.step_ns, self.scale = round(1e9 * self.env.dt), self.env.action_scale * TURN
         self._seen: np.ndarray = np.empty(0)
         self._begun = 0  # the seed of the scene
@@ -159,6 +160,10 @@ class MetaWorld(GymWorld):
     def movable(self) -> np.ndarray:
         """Return where all is that is not the robot, without orientations."""
         return np.array(self.env.data.qpos[self._movable])
+
+    def gap(self) -> float:
+        """Return how far the robot is from what is not the robot and moves, m."""
+        return self._gap(self.env.data)
 
     def picture(self) -> np.ndarray:
         """Return what a camera beside the robot sees."""

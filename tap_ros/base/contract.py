@@ -11,6 +11,8 @@ CONTROL_PERIOD = 0.25  # s that one action takes
 MOVE_LIMIT = 0.08  # m per control period, |dx| and |dy|
 CLIMB_LIMIT = 0.15  # m per control period, |dz|
 ACTION_LIMIT = (MOVE_LIMIT, MOVE_LIMIT, CLIMB_LIMIT)
+# m/s, of each axis of a command; an arm whose control period is another one is no faster.
+SPEED_LIMIT = tuple(limit / CONTROL_PERIOD for limit in ACTION_LIMIT)
 
 # Where the fingertips may be, x, y, z in m; at z = 0 they just clear the table.
 WORKSPACE_LOW = (-0.45, -0.45, 0.0)

@@ -19,7 +19,7 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from tap_ros.base import plugins
-from tap_ros.base.contract import ROBOT_MASKS
+from tap_ros.base.contract import CONTROL_PERIOD, ROBOT_MASKS
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import listing
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
@@ -51,6 +51,8 @@ class Shared:
     :param robot_mask: What camera/robot_mask takes out of the pictures: nothing (none), the arm
         with its shadow (arm), or the whole robot (all). What was seen there free last takes its
         place.
+    :param control_period: Seconds (of image stamps) that the arm takes for one command: it moves
+        by its velocity times this.
     :param joint_prefix: What the names of the robot's joints begin with in joint_states, before
         shoulder_pan_joint and so on.
     :param arm: The arm. Heeded, as where it stands, where joint_states has its joints and not
@@ -63,6 +65,7 @@ class Shared:
     device: str = setting('cpu', choices=('cpu', 'cuda'))
     image_transport: str = setting('raw', choices=('raw', 'compressed'))
     robot_mask: str = setting('none', choices=ROBOT_MASKS)
+    control_period: float = setting(CONTROL_PERIOD, between=(0.05, 10.0))
     joint_prefix: str = ''
     arm: str = setting(DEFAULT_ARM, plugins='tap_ros.arms')
     fixed_opening: float = setting(0.0, between=(0.0, 1.0))

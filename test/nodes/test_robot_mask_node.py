@@ -66,7 +66,7 @@ def test_the_simulator_tells_where_its_robot_is(sim, client):
 
     command = TwistStamped(header=image.wait(10).header)
     assert aside.wait(10).header == command.header, 'who comes late is shown it, too'
-    command.twist.linear.x = 0.05
+    command.twist.linear.x = 0.05 / CONTROL_PERIOD
     before = decode_gripper(joints.wait(10))
     twist.publish(command)
     then = to_nanoseconds(command.header.stamp) + round(CONTROL_PERIOD * 1e9)

@@ -8,7 +8,7 @@ from threading import Event
 import time
 
 from driven import SEED, select
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped, Vector3
 import numpy as np
 from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
@@ -64,9 +64,10 @@ class Scene:
         return dict(zip(names, pixels.tolist()))
 
     def move(self, *move):
-        """Let one control period pass; return the stamp of the next picture."""
+        """Move so many metres in one control period; return the stamp of the next picture."""
         command = TwistStamped(header=self.image.wait(10).header)
-        command.twist.linear.x, command.twist.linear.y, command.twist.linear.z = move
+        x, y, z = np.array(move) / CONTROL_PERIOD
+        command.twist.linear = Vector3(x=x, y=y, z=z)
         self.twist.publish(command)
         return to_nanoseconds(command.header.stamp) + round(CONTROL_PERIOD * 1e9)
 
