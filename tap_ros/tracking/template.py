@@ -32,6 +32,7 @@ class Template:
     :param place: (2,) of the object; points are relative to it.
     :param angle: of the object in this picture, relative to the first one, rad.
     :ivar area: px.
+    :ivar metric: Metric of the colours.
     :ivar outline: (N, 2) m around the place.
     """
 
@@ -39,7 +40,8 @@ class Template:
                  angle: float = 0.0, face: np.ndarray | None = None) -> None:
         rng = np.random.default_rng(0)
         self.place, self.angle, self.area = place, angle, int(mask.sum())
-        self.palette = Palette(picture.lab[mask])
+        self.metric = picture.metric
+        self.palette = Palette(picture.lab[mask], self.metric)
         self.outline = plane.of_top(outline(mask)) - place
         part = mask if face is None else face
         if plane.blur:  # pixels at its edge are mixed with the table
