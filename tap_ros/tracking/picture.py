@@ -10,6 +10,7 @@ from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import View
 
 FEW = 4  # colours of a Palette, at most
+NEAR = 15.4  # distance from a colour of an object below which it has that colour
 TONE = 0.03  # of the light or of a channel, from which on a change is taken back
 DARK, BRIGHT = 12, 243  # levels between which a change of light shows
 
@@ -117,9 +118,26 @@ class Palette:
                 cv2.KMEANS_PP_CENTERS)
             shares = np.bincount(np.ravel(labels), minlength=FEW) / len(labels)
             centres = np.asarray(found)[shares >= min(least, shares.max())]
-        self._table = np.min([sum(np.abs(axis - value) for axis, value in zip(metric.axes, centre))
-                              for centre in centres], 0).ravel()
+        far = [sum(np.abs(axis - value) for axis, value in zip(metric.axes, centre)).ravel()
+               for centre in centres]
+        self._table, self._nearest = np.min(far, 0), np.argmin(far, 0).astype(np.uint8)
+        self._near = np.packbits(np.array(far) < NEAR, 0, 'little')[0]
 
     def distance(self, index: np.ndarray) -> np.ndarray:
         """Return the distances of colours by their index, any shape, float32."""
         return self._table.take(index)
+
+    def nearest(self, index: np.ndarray) -> np.ndarray:
+        """Return which of the colours is nearest, 0 to FEW - 1, by the index of another."""
+        return self._nearest.take(index)
+
+    def recurs(self, index: np.ndarray, wanted: np.ndarray) -> float:
+        """
+        Return how alike the shares of each colour are, 0 to 1; shades of one stand for another.
+
+        :param index: of the colours of some points.
+        :param wanted: of others, which of the colours is nearest.
+        """
+        near = self._near.take(index)[..., None] >> np.arange(FEW) & 1
+        shares = np.bincount(wanted, minlength=FEW) / max(len(wanted), 1)
+        return float(np.minimum(near.reshape(-1, FEW).sum(0) / max(index.size, 1), shares).sum())

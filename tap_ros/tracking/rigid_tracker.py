@@ -33,6 +33,7 @@ SHARED = 0.8  # of the part of an object that was known, in what is all of it
 UNSURELY = 0.8  # factor of the confidence in an object whose middle is not known
 WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
+RECURS = 0.6  # share of the colours of the first template in such a cut
 KEYS = 6  # templates of an object, the first among them
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
 MOST = (0.5, 1.8)  # of its area, that has to be there then
@@ -120,7 +121,7 @@ class RigidTracker:
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
         picture = picture.by(one.face.metric)
-        if one.state == SEEN and one.around is not None and _still(*one.around, picture):
+        if one.age == 0 and one.around is not None and _still(*one.around, picture):
             return
         one.around, one.waits = None, one.waits - 1
         if one.age and hand is not None:
@@ -130,7 +131,8 @@ class RigidTracker:
         pose = self._search(one, keys, matcher, hand)
         if pose is not None and pose.fit > GOOD:
             one.place, one.angle, one.shown = pose.place, pose.angle, pose.template
-            one.age, one.state, one.confidence = 0, SEEN, pose.confidence
+            one.age, one.confidence = 0, pose.confidence
+            one.state = (SEEN if pose.sure else HIDDEN if pose.seen < 0.5 else UNSURE)
             nearest = min(abs(_turned(other.angle - one.angle)) for other in one.keys)
             one.around = self._window(one), picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
@@ -207,19 +209,22 @@ class RigidTracker:
             other.place for other in self._objects if other is not one)])
         one.waits = WAITS
         outline = self._outline(one)
+        before = cv2.fillPoly(np.zeros(picture.size, np.uint8), [np.rint(outline).astype(int)], 1)
+        if _reaches(before, picture.hidden):
+            return
         radius = min(float(np.linalg.norm(outline - at, axis=1).max()) * 1.4 + 4, RADII[1])
         cut = silhouette(picture, at, others, 0.0 if one.part else radius)
         mask = cut.mask
-        if (cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0)[
-                picture.hidden].any():
+        if _reaches(mask.astype(np.uint8), picture.hidden):
             return
         if not one.part:
-            if 0.6 < mask.sum() / one.keys[0].area < 1.6:
+            if 0.6 < mask.sum() / one.keys[0].area < 1.6 and one.keys[0].palette.recurs(
+                    picture.index[mask], one.keys[0].kinds) > RECURS:
                 key = Template(picture, self._plane, mask, one.place, one.angle)
                 one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
             return
-        before = cv2.fillPoly(np.zeros(mask.shape, np.uint8), [np.rint(outline).astype(int)], 1)
-        if cut.whole and not cut.touched and cut.off(at) < OFF and before[mask].sum() > SHARED * before.sum():
+        if cut.whole and not cut.touched and cut.off(at) < OFF and (
+                before[mask].sum() > SHARED * before.sum()):
             face, one.part, one.sure = top_face(mask, self._plane), False, True
             if self._snap:
                 one.place = self._plane.of_top(centre(face))
@@ -245,6 +250,11 @@ def _still(window: tuple[slice, slice], before: Picture, now: Picture) -> bool:
         return False
     apart = cv2.absdiff(before.lab[window], now.lab[window])
     return bool((np.asarray(apart) > SAME).mean() < 0.003)
+
+
+def _reaches(mask: np.ndarray, hidden: np.ndarray) -> bool:
+    """Tell whether the robot hides anything next to a mask, both (h, w)."""
+    return bool((cv2.dilate(mask, np.ones((7, 7), np.uint8)) > 0)[hidden].any())
 
 
 def _pushed(one: _Object, hand: np.ndarray) -> np.ndarray:
