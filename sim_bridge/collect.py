@@ -15,7 +15,7 @@ import json
 from math import inf, nan
 from pathlib import Path
 import time
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from sim_bridge.tasks.tasks import get_task, TIMINGS
@@ -58,6 +58,8 @@ class CollectConfig:
         late, drawn for each episode.
     :param misses: share of the pushes that are at random, so that objects are hit, grazed and
         missed: what a forward model has to tell apart.
+    :param pushes: in another world, to record what the planner sees there, with robot masks and
+        objects: pushes of its object to the 'goal', or at 'random' for a forward model.
     :param look: of the world: the whole arm at its table, or its hand alone.
     :param appearance: of table, light and camera; 'random' is drawn anew for every episode.
     :param arm: at the table.
@@ -72,6 +74,7 @@ class CollectConfig:
     frames: int = 0
     timing: Annotated[str, one_of(TIMINGS)] = 'natural'
     misses: float = 0.0
+    pushes: Literal['', 'goal', 'random'] = ''
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     appearance: Annotated[str, one_of(CHOICES)] = 'usual'
     arm: Annotated[str, one_of(names('tap_ros.arms'))] = DEFAULT_ARM
@@ -166,6 +169,11 @@ def _check(config: CollectConfig, make: Make | None) -> None:
         world = _make(config, make)
         ability(world, 'demonstrate')
         world.close()
+        if config.pushes and not getattr(world, 'slides', False):
+            raise ConfigError(f'pushes: nothing can be pushed about in {config.task} of '
+                              f'{config.world}; leave it out')
+    elif config.pushes:
+        raise ConfigError(f'pushes: of other worlds; in {TABLE} see misses')
     elif get_task(config.task).kind != 'push' and (config.misses or config.timing != 'natural'):
         raise ConfigError(f'misses and timing are of tasks of pushing, not of {config.task}')
 
@@ -227,7 +235,9 @@ def _collect_shard(folder: str, config: CollectConfig, shard: int,
                    make: Make | None) -> list[dict[str, Any]]:
     """Collect one file; runs in a worker process. Return what is told of each of its episodes."""
     world, rows = _make(config, make), []
-    how = {'timing': config.timing, 'misses': config.misses} if config.world == TABLE else {}
+    how: dict[str, Any] = {'pushes': config.pushes} if config.pushes else {}
+    if config.world == TABLE:
+        how = {'timing': config.timing, 'misses': config.misses}
     with EpisodeWriter(_shard_path(folder, shard), camera_matrix=world.camera_matrix) as writer:
         for i in _episodes(config, shard):
             times = [time.perf_counter()]

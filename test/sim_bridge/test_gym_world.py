@@ -13,7 +13,7 @@ from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.protocol import make_world
 from tap_ros.base.engines import Engine
-from tap_ros.base.errors import SceneError, TapError
+from tap_ros.base.errors import ConfigError, SceneError, TapError
 from tap_ros.recording.cache import open_recordings
 
 
@@ -200,3 +200,38 @@ def test_what_settles_or_is_struck_in_passing_is_not_the_bottleneck_and_why_none
     late = np.arange(20) == 19
     assert found(np.where(late, 0, 0.03), 1.0 * late) == (
         None, 'the hand comes with the last frame')
+
+
+def test_pushes_are_recorded_as_a_planner_and_its_model_need_them(tmp_path):
+    pytest.importorskip('metaworld')
+    for task, pushes in (('plate-slide-v3', 'goal'), ('push-v3', 'random')):
+        folder = tmp_path / task
+        config = CollectConfig(world='metaworld', task=task, pushes=pushes, episodes=1,
+                               seed=3, image_size=32)
+        collect(folder, config, Engine(workers=1), progress=False)
+        episode, = open_recordings(folder)
+        assert episode.object_source == 'ground_truth' and episode.robot_masks.any()
+        moved = episode.grippers[1:, :3] - episode.grippers[:-1, :3]
+        assert np.median(np.abs(moved - episode.actions[:-1, :3])) < 0.01, 'as it was told'
+        if pushes == 'goal':
+            assert (episode.task, episode.outcome) == (task, 'success')
+            places = episode.object_poses[:, 0]
+            way = np.linalg.norm(places - places[0], axis=1)
+            assert way[:4].max() < 0.01 and way[-1] > 0.1
+    for bad, words in (({'task': 'door-open-v3'}, 'nothing can be pushed about in door-open-v3'),
+                       ({'world': 'mujoco_table', 'task': 'push2'}, 'see misses')):
+        with pytest.raises(ConfigError, match=words):
+            collect(tmp_path / 'bad', replace(config, **bad), progress=False)
+    assert not (tmp_path / 'bad').exists()
+
+
+def test_what_stands_in_the_way_is_passed_by():
+    pytest.importorskip('metaworld')
+    world = make_world('metaworld', 'push-wall-v3', 32)
+    around = [world.demonstrate(seed, pushes='goal').episode for seed in (500, 501)]
+    assert {episode.outcome for episode in around} == {'success'}
+    for episode in around:
+        for way in world.ways:
+            gaps = episode.object_poses[:, 0, :2] - way
+            assert np.linalg.norm(gaps, axis=1).min() < 0.06
+    world.close()

@@ -53,6 +53,7 @@ class ExplorerNode(Node):
         self._changed: set[str] = set()  # kinds whose newest message was not shown yet
         self._states = NodeStates()
         self._task = self.params['task']
+        self._seed: int | None = None  # of the scene, once it is told
         self._scenes = 0  # that have begun
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
         kind, topic = camera_image(self.params)
@@ -118,8 +119,8 @@ class ExplorerNode(Node):
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:
-            self._task = escaped(message.task, 40)
-            self._display.events.add(f'scene: {self._task}, seed {message.seed}')
+            self._task, self._seed = escaped(message.task, 40), message.seed
+            self._display.events.add(f'scene: {self._task}, seed {self._seed}')
             self._calls.forget_end()
             self._scenes += 1
             with self._display.lock:
@@ -162,8 +163,8 @@ class ExplorerNode(Node):
         now, simulator, tracker = (
             time.monotonic(), calls.offered('reset'), calls.offered('select'))
         self._server.put('state', json.dumps({
-            'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
-            'scene': self._scenes, 'simulator': simulator, 'tracker': tracker,
+            'kind': 'state', 'tasks': names('tap_ros.tasks'), 'task': self._task,
+            'seed': self._seed, 'scene': self._scenes, 'simulator': simulator, 'tracker': tracker,
             'predictor': calls.offered('predict'), 'planner': calls.offered('cancel'),
             'plans': not simulator or not display.grips(self._task),
             'observer': self.count_publishers(OBSERVER) > 0,

@@ -98,11 +98,10 @@ function ticks() {
 function drawTicks(last) {
   const ends = {}, width = $('ticks').clientWidth;
   fill($('ticks'), ticks().sort(([one], [other]) => one - other), ([t, kind, text]) => {
-    const tick = Object.assign(button('', () => go(t)), {className: kind, title: `${text}, ${second(t)}`, ariaLabel: `${text}, ${second(t)}`});
-    const row = kind === 'move', half = 4 * text.length, middle = width * t / last;
-    if (middle - half > (ends[row] ?? -half)) { ends[row] = middle + half; tick.textContent = text; }
-    tick.style.left = `${100 * t / last}%`;
-    return tick;
+    const row = kind === 'move', half = 4 * text.length, middle = width * t / last, room = middle - half > (ends[row] ?? -half);
+    if (room) ends[row] = middle + half;
+    return Object.assign(button(room ? text : '', () => go(t)),
+      {className: kind, title: `${text}, ${second(t)}`, ariaLabel: `${text}, ${second(t)}`, style: `left: ${100 * t / last}%`});
   });
 }
 

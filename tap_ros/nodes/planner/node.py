@@ -331,8 +331,9 @@ class VisualMpcNode(LifecycleBase):
         self._diagnostics.took(plan.planning_ms, 'plan')
         self._distance.publish(Float64(data=reach.distance))
         if self._overlay.get_subscription_count():
-            picture = draw_plan(seen.image, self._model.config, plan, seen.gripper,
-                                reach.targets[command.stage].pixels)
+            picture = draw_plan(
+                seen.image, self._model.config, plan, seen.gripper,
+                reach.targets[command.stage].pixels, self._inputs.sharp(seen))
             self._overlay.publish(encode_image(
                 picture, to_stamp(seen.stamp_ns), self._inputs.frame_id))
         stage = 'goal' if command.stage == subgoals else 'subgoal' + (

@@ -23,11 +23,8 @@ function connect() {
     setTimeout(connect, RECONNECT_MS);
   };
   socket.onmessage = ({data}) => {
-    if (typeof data === 'string') {
-      take(JSON.parse(data));
-    } else {
-      takePicture(new Uint8Array(data));
-    }
+    if (typeof data === 'string') take(JSON.parse(data));
+    else takePicture(new Uint8Array(data));
   };
 }
 
@@ -37,7 +34,10 @@ function take(message) {
   if (message.kind === 'state') {
     const before = state;
     state = message;
-    if (before && before.scene !== state.scene) select(false);
+    if (before && before.scene !== state.scene) {
+      step = '';
+      select(false);
+    }
     if (before && state.problem.count > before.problem.count) showError(state.problem.text);
     else if (before && state.events !== before.events) $('error').textContent = '';  // it went on
     if (moved && JSON.stringify(state.goal.objects) !== moved.until) moved = null;
@@ -82,22 +82,22 @@ function progress() {
   const count = camera.objects.length, missing = missingGoals();
   const camera_why = !camera.width ? 'waits for the camera' : camera.note && `the camera is ${camera.note}`;
   const goal_why = goal.pictured ? '' : 'needs a goal picture: step 3';
+  const predict_why = camera_why || goal_why || (!state.predictor && 'needs the predictor, which does not run');
   const go_why = !state.plans ? `nothing plans how to grasp: for ${state.task} subgoals are predicted only`
     : camera_why || (!count && 'needs objects: step 2') || (missing.length && `needs the goal of ${missing.join(', ')}: step 3`)
     || (!state.planner && 'needs the planner, which does not run');
-  const clicked = clicks.length ? `${clicks.length} marked: mark the others, then follow` : 'waits for objects: click on them';
+  const clicked = clicks.length ? `${clicks.length} clicked; when all are, follow` : 'waits for objects: click on them';
   const unsure = camera.objects.filter((one) => ['unsure', 'lost'].includes(one.state)).map(({name}) => name);
   return {
-    scene: [!camera_why, camera_why || (simulator ? state.task : `${camera.width}x${camera.height} pixels`)],
+    scene: [!camera_why, camera_why || (simulator ? `${state.task}${state.seed === null ? '' : `, seed ${state.seed}`}` : `${camera.width}x${camera.height} pixels`)],
     objects: [count > 0 && !anew, selecting() ? clicked : !count ? 'waits for objects'
       : unsure.length ? `not sure of ${unsure.join(', ')}` : tracker ? `${count} followed` : `${count} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
       ? `waits for a goal: ${simulator ? 'start a scene' : 'photograph it'}`
       : count && missing.length ? `drag ${missing.join(', ')} to its goal` : goal.pictured ? 'the picture is there' : 'placed by hand',
     camera_why],
-    predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : goal_why || 'ready',
-      camera_why || goal_why || (!state.predictor && 'needs the predictor, which does not run')],
-    go: [run.reached, run.running ? run.stage : run.end || go_why || 'ready', go_why, go_why || goal_why]};
+    predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : predict_why || 'ready', predict_why],
+    go: [run.reached, run.running ? run.stage : run.end || go_why || 'ready', go_why]};
 }
 
 function showState() {
@@ -119,7 +119,7 @@ function showState() {
   allow('photograph', busy || done.goal[2]);
   allow('predict', busy || done.predict[2]);
   allow('direct', busy || done.go[2], 'to the goal at once');
-  allow('subgoal-run', busy || done.go[3] || done.predict[2], 'first to a predicted subgoal');
+  allow('subgoal-run', busy || done.go[2] || done.predict[2], 'first to a predicted subgoal');
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
   $('propose').hidden = $('follow').hidden = !selecting();
@@ -164,7 +164,11 @@ function open(one, moves = state.run.end) {
 }
 
 function hint() {
-  if (view === 'camera' && selecting()) return clicks.length ? 'Click the middle of the next object, or press "follow".' : 'Click the middle of each object that is to be moved.';
+  if (view === 'camera' && selecting()) {
+    return clicks.length ? 'Click the middle of the next object, or press "follow".'
+      : state.simulator || state.goal.pictured ? 'Click the middle of each object that is to be moved.'
+        : 'Photograph the objects where they are to be, put them back, then click the middle of each.';
+  }
   const missing = missingGoals(), moves = movable();
   return {
     camera: `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
@@ -208,7 +212,7 @@ $('propose').addEventListener('click', () => {
 });
 $('selection').addEventListener('submit', (event) => {
   event.preventDefault();
-  follow();
+  send({do: 'select', objects: clicks.map(({name, u, v}) => ({name, u, v}))});
 });
 $('again').addEventListener('click', () => select(!anew));
 on('photograph', {do: 'photograph'});

@@ -40,10 +40,6 @@ function select(again) {
   if (again) look('camera');
 }
 
-function follow() {
-  send({do: 'select', objects: clicks.map(({name, u, v}) => ({name, u, v}))});
-}
-
 function showClicks() {
   listed = false;
   if (state) showState();

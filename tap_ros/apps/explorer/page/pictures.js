@@ -106,15 +106,8 @@ function colourOf(name) {
   return COLOURS[[...new Set(names)].indexOf(name) % 4];
 }
 
-function mark(colour) {
-  const item = made('i');
-  item.style.background = colour;
-  return item;
-}
-
-function radius(context) {
-  return context.canvas.width / context.getTransform().a * 0.035;
-}
+const mark = (colour) => made('i', {style: `background: ${colour}`});
+const radius = (context) => context.canvas.width / context.getTransform().a * 0.035;
 
 /* An outline moves with its object's pixel: it is not turned, and shows no angle. */
 function drawOutlined(context, {u, v, state: known}, colour, outline) {
