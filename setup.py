@@ -8,7 +8,7 @@ import sys
 from setuptools import find_packages, setup
 
 NAME = 'tap_ros'
-NODE_CLASSES = run_path('tap_ros/base/contract.py')['NODE_CLASSES']
+CONTRACT = run_path('tap_ros/base/contract.py')
 REQUIRED = [  # for pip
     'jinja2>=3.1',
     'lz4>=4.3',
@@ -30,7 +30,7 @@ REQUIRED = [  # for pip
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version=CONTRACT['VERSION'],
     description='Time-agnostic prediction of subgoal images, and visual MPC, for ROS 2',
     maintainer='The tap_ros authors',
     maintainer_email='tap_ros@users.noreply.github.com',
@@ -62,6 +62,6 @@ setup(
     },
     zip_safe=False,
     entry_points={
-        'console_scripts': [f'{name} = tap_ros.ros.run:main' for name in NODE_CLASSES],
+        'console_scripts': [f'{name} = tap_ros.ros.run:main' for name in CONTRACT['NODE_CLASSES']],
     },
 )

@@ -12,6 +12,7 @@ from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import (
     EqualsSubstitution,
+    IfElseSubstitution,
     LaunchConfiguration,
     NotEqualsSubstitution,
     PathJoinSubstitution,
@@ -92,6 +93,8 @@ def start(executable, parameters=None, condition=None):
     return Node(
         package='tap_ros', executable=executable, namespace=LaunchConfiguration('namespace'),
         parameters=[LaunchConfiguration('params_file'), parameters],
+        # The clock of this simulation is in its namespace; another one's is not.
+        remappings=[('/clock', IfElseSubstitution(LaunchConfiguration('sim'), 'clock', '/clock'))],
         condition=condition, output='screen', emulate_tty=True)
 
 

@@ -30,5 +30,10 @@ fi
 if [ -f "$tap_root/install/setup.bash" ]; then
   . "$tap_root/install/setup.bash"
 fi
+unset -f ros2
+command -v ros2 >/dev/null || ros2() {
+  echo 'The ros2 command is not built. Type once: make ros2; then: . scripts/environment.bash' >&2
+  return 127
+}
 [ -z "$tap_nounset" ] || set -u
 unset tap_root tap_nounset

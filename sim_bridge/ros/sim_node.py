@@ -20,8 +20,9 @@ from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode
 from tap_msgs.srv import ResetScene, SetGoal, StepScene
-from tap_ros.base.contract import ACTION_LIMIT, CONTROL_PERIOD, WORLD_FRAME
+from tap_ros.base.contract import CONTROL_PERIOD, SPEED_LIMIT, WORLD_FRAME
 from tap_ros.base.errors import TapError
+from tap_ros.messages import topics
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.robots.arm import DEFAULT_ARM
@@ -43,6 +44,7 @@ class SimNode(Node):
     """
     Steps and renders in the thread that spins, to which the OpenGL context belongs.
 
+    A command is a velocity, m/s, that lasts for one control period.
     Lock-step: a command stamped like the newest image, or unstamped, lets one control period pass.
     Meanwhile the newest image, and what belongs to it, is sent again every resend_period with the
     same stamp, for nodes that start late.
@@ -80,6 +82,8 @@ class SimNode(Node):
         self._episode = self.create_publisher(Episode, 'episode', STREAM)
         self._lock_step = self.create_publisher(Bool, LOCK_STEP, LATCHED)
         self._lock_step.publish(Bool(data=self.params['lock_step']))
+        self.create_publisher(Float64, topics.CONTROL_PERIOD.name, LATCHED).publish(
+            Float64(data=CONTROL_PERIOD))
         # Subscribed before the twist, so that of two commands sent together it is taken first.
         subscribe: Callable[..., Any] = self.create_subscription  # rclpy does not type the info
         subscribe(Float64, 'gripper/command', self._on_gripper, STREAM)
@@ -122,8 +126,9 @@ class SimNode(Node):
     def _on_twist(self, message: TwistStamped, info: dict[str, Any]) -> None:
         self._diagnostics.received('arm/delta_twist_cmds')
         stamp_ns = to_nanoseconds(message.header.stamp)
-        move = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
-        if stamp_ns == 0 and not move.any():
+        speed = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
+        move = CONTROL_PERIOD * speed
+        if stamp_ns == 0 and not speed.any():
             self._twist = None
             return
         if reason := self._refuse_paused(info) or self._refuse_twist(
@@ -132,9 +137,9 @@ class SimNode(Node):
             self._diagnostics.error(f'arm/delta_twist_cmds ignored: {reason}')
             self._refused.publish(CommandRefused(header=message.header, message=reason))
             return
-        if (np.abs(move) > ACTION_LIMIT).any():
+        if (np.abs(speed) > SPEED_LIMIT).any():
             self.get_logger().warning(
-                f'arm/delta_twist_cmds limited: {move} to +-{ACTION_LIMIT} m per control period',
+                f'arm/delta_twist_cmds limited: {speed} to +-{SPEED_LIMIT} m/s',
                 throttle_duration_sec=5.0)
         self._answered_ns = max(stamp_ns, self._answered_ns)
         if self.params['lock_step']:

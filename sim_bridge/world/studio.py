@@ -22,7 +22,7 @@ from sim_bridge.world.looks import Appearance, USUAL
 from sim_bridge.world.scene import ARM_GEOM_GROUP
 from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.base.errors import SceneError
-from tap_ros.robots.arm import Arm
+from tap_ros.robots.arm import Arm, rpy
 
 SAMPLES = 2  # along each side of a pixel
 MOST_GEOMS = 400  # with shadows
@@ -190,10 +190,13 @@ def _add_arm(spec: mujoco.MjSpec, arm: Arm) -> None:
         name=f'{arm.name}_base', pos=arm.mount.position,
         quat=[np.cos(half), 0, 0, np.sin(half)])
     bodies = [body]
-    for joint, link, (place, roll) in zip(arm.joints, arm.links[1:], arm.origins):
+    for joint, link, (place, turn) in zip(arm.joints, arm.links[1:], arm.origins):
+        (cr, cp, cy), (sr, sp, sy) = (of(np.array(rpy(turn)) / 2) for of in (np.cos, np.sin))
         body = body.add_body(
-            name=link, pos=place, quat=[np.cos(roll / 2), np.sin(roll / 2), 0, 0], mass=1.0,
-            inertia=[0.01] * 3, explicitinertial=True)
+            name=link, pos=place, quat=[
+                cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy,
+                cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy],
+            mass=1.0, inertia=[0.01] * 3, explicitinertial=True)
         body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
         bodies.append(body)
     for shape in arm.shapes:

@@ -12,6 +12,7 @@ import sys
 import time
 from typing import Any, Self
 
+from tap_ros.base.contract import OWNED
 from tap_ros.base.errors import TapError
 import yaml
 
@@ -41,7 +42,8 @@ class NodeProcesses:
     """
     Processes of nodes, ended with the with-block; each logs into a file of its own.
 
-    SIGTERM and SIGHUP, as of a terminal that is closed, leave the block, too.
+    SIGTERM and SIGHUP, as of a terminal that is closed, leave the block, too. If this process is
+    killed, nodes see that their standard input closes, and end themselves.
 
     :param log_folder: folder of the logs, made if it is not there.
     :param namespace: of the nodes, such as '/left'.
@@ -71,8 +73,8 @@ class NodeProcesses:
         with self._log(name).open('wb') as log:
             # A session of its own: Ctrl-C reaches us, and we end the nodes in order.
             self._processes[name] = subprocess.Popen(
-                command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-                start_new_session=True)
+                command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.PIPE,
+                start_new_session=True, env=os.environ | {OWNED: '1'})
 
     def check(self) -> None:
         """
@@ -133,6 +135,9 @@ class NodeProcesses:
                 except subprocess.TimeoutExpired:
                     process.kill()
                     process.wait()
+        for process in processes:
+            if process.stdin is not None:
+                process.stdin.close()
 
     def _log(self, name: str) -> Path:
         return self._folder / f'{name}.log'

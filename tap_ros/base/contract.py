@@ -11,6 +11,8 @@ CONTROL_PERIOD = 0.25  # s that one action takes
 MOVE_LIMIT = 0.08  # m per control period, |dx| and |dy|
 CLIMB_LIMIT = 0.15  # m per control period, |dz|
 ACTION_LIMIT = (MOVE_LIMIT, MOVE_LIMIT, CLIMB_LIMIT)
+# m/s, of each axis of a command; an arm whose control period is another one is no faster.
+SPEED_LIMIT = tuple(limit / CONTROL_PERIOD for limit in ACTION_LIMIT)
 
 # Where the fingertips may be, x, y, z in m; at z = 0 they just clear the table.
 WORKSPACE_LOW = (-0.45, -0.45, 0.0)
@@ -46,6 +48,7 @@ ROBOT_MASK_FREE = 0  # neither robot nor shadow
 ROBOT_MASK_HAND = 128  # the hand (gripper) or its shadow
 ROBOT_MASK_ARM = 255  # the arm or its shadow
 ROBOT_MASKS = ('none', 'arm', 'all')  # what is taken for hidden: nothing, arm, arm and hand
+VERSION = '0.1.0'  # of both packages
 MODES = ('bidirectional', 'forward')  # of predictors: between start and goal, or after the start
 
 # Module and class of each node, by the name of the node and of its executable.
@@ -58,6 +61,7 @@ NODE_CLASSES = {
     'tracker_node': 'tap_ros.nodes.tracker.node:TrackerNode',
     'explorer_node': 'tap_ros.apps.explorer.node:ExplorerNode',
 }
+OWNED = 'TAP_ROS_OWNED'  # environment variable of a node that ends when its standard input closes
 
 
 def step_budget(num_objects: int) -> int:

@@ -64,6 +64,8 @@ JOINT_STATES = Topic('joint_states', 'sensor_msgs/msg/JointState', 'joint', peri
 # Numbers by name, of whatever the robot measures; joints of which nothing is known move no arm.
 SIGNALS = Topic('signals', JOINT_STATES.type, 'signal')
 TWIST = Topic('arm/delta_twist_cmds', 'geometry_msgs/msg/TwistStamped', 'twist')
+# Seconds that one of these velocities is meant for. Recordings without it have metres instead.
+CONTROL_PERIOD = Topic('arm/control_period', 'std_msgs/msg/Float64', 'period', latched=True)
 GRIPPER_COMMAND = Topic('gripper/command', 'std_msgs/msg/Float64', 'command')
 GOAL_IMAGE = Topic('goal/image', IMAGE_TYPE, 'goal', latched=True, compressed=True)
 GOAL_ROBOT_MASK = Topic('goal/robot_mask', IMAGE_TYPE, 'goal_mask', latched=True,
@@ -78,8 +80,8 @@ MODEL_CARDS = tuple(Topic(f'{node}/model_card', 'std_msgs/msg/String', latched=T
                     for node in ('predictor_node', 'visual_mpc_node'))
 TOPICS = (
     IMAGE, ROBOT_MASK, CAMERA_INFO, CAMERA_POSE, OBJECTS, JOINT_STATES, SIGNALS, TWIST,
-    GRIPPER_COMMAND, GOAL_IMAGE, GOAL_ROBOT_MASK, GOAL_OBJECTS, TRUE_OBJECTS, TRUE_GOAL_OBJECTS,
-    EPISODE, CLOCK,
+    CONTROL_PERIOD, GRIPPER_COMMAND, GOAL_IMAGE, GOAL_ROBOT_MASK, GOAL_OBJECTS, TRUE_OBJECTS,
+    TRUE_GOAL_OBJECTS, EPISODE, CLOCK,
     Topic('subgoal', 'tap_msgs/msg/Subgoal', latched=True),
     Topic('subgoal/image', IMAGE_TYPE, latched=True),
     Topic('subgoal/overlay', IMAGE_TYPE, latched=True),

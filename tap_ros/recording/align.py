@@ -13,6 +13,7 @@ from dataclasses import replace
 import warnings
 
 import numpy as np
+from tap_ros.base.contract import CONTROL_PERIOD
 from tap_ros.base.errors import RecordingWarning
 from tap_ros.messages.joints import contradicted, PLACE, positions_at
 from tap_ros.messages.stamps import MAX_GAP
@@ -68,7 +69,7 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
         parts=parts, starts=clock.starts, spans=spans, stamps=frame.stamp, logs=frame.log,
         places={'frame': (frame.file, frame.index), 'mask': _masks(tracks['mask'], clock, parts),
                 **_goals(tracks, spans, gaps)},
-        actions=_actions(tracks, clock),
+        actions=_actions(tracks, clock, any('period' in part.topics for part in parts)),
         grippers=_grippers(tracks, clock, arm, parts[0].source),
         objects=_by_name(*clock.nearest_rows(tracks['object']), tracks['object'], names,
                          picked[clock.owner]),
@@ -189,18 +190,24 @@ def _without_repeats(frame: Track, owner: np.ndarray) -> tuple[Track, np.ndarray
     return replace(frame, stamp=stamp), owner
 
 
-def _actions(tracks: dict[str, Track], clock: _Clock) -> np.ndarray:
+def _actions(tracks: dict[str, Track], clock: _Clock, velocities: bool) -> np.ndarray:
     """
     Return (F, 4) float32: row t is what was sent between frame t and frame t + 1, the last wins.
 
     A gripper opening holds until another is commanded. The last row of an episode is zeros.
+
+    :param velocities: commands are m/s, of the control period told last; else metres in one.
     """
     actions = np.zeros((len(clock.times), 4), np.float32)
     twist, command, logs = tracks['twist'], tracks['command'], clock.frame.log
     times, rows = clock.rows(twist)
     step = np.searchsorted(clock.times, times, 'right') - 1
+    period, unit = tracks['period'], np.array([[CONTROL_PERIOD if velocities else 1.0]])
+    if len(period):
+        newest = np.searchsorted(period.log, twist.log[rows], 'right') - 1
+        unit = period.picked(np.maximum(newest, 0))
     with np.errstate(over='ignore'):  # absurd numbers become infinite
-        actions[step[step >= 0], :3] = twist.picked(rows[step >= 0])
+        actions[step[step >= 0], :3] = (unit * twist.picked(rows))[step >= 0]
         if len(command) and len(logs):
             by_log = np.argsort(logs, kind='stable')
             newest = np.empty(len(logs), np.int64)

@@ -33,7 +33,7 @@ from tap_ros.recording.views import first_return, look
 from tap_ros.robots.arm import find_joints, known_arms, MOST_JOINTS
 
 PICTURES = ('frame', 'mask', 'goal', 'goal_mask')
-WIDTHS = {'frame': 1, 'twist': 3, 'command': 1, 'joint': 4, 'arm': MOST_JOINTS,
+WIDTHS = {'frame': 1, 'twist': 3, 'command': 1, 'period': 1, 'joint': 4, 'arm': MOST_JOINTS,
           'object': 9, 'goal_object': 9, 'signal': 1}  # of the values of a message, or of each
 # object or signal in it
 NAMED = ('object', 'goal_object', 'signal')  # whose index is the number of the names
@@ -53,7 +53,8 @@ class Columns:
     arrays: <name> (N, 4) int64 log time, stamp (0: none), place in the file, and an index: row of
         the pictures (-1: empty), number of the names of objects, or event of a mark; and
         frame_values (N, 1) float64 checksum of the message
-        twist_values (N, 3) float64 linear; command_values (N, 1) gripper opening
+        twist_values (N, 3) float64 linear; period_values (N, 1) s, above 0, by which they are
+        multiplied; command_values (N, 1) gripper opening
         joint_values (N, 4) gripper state, NaN where unknown
         arm_values (N, MOST_JOINTS) rad, of an arm where the gripper's place is not told
         object_values, goal_object_values (sum of objects, 9) u, v, pose
@@ -172,8 +173,8 @@ class _Decoder:
         self.decoders: dict[str, Callable[[str, int, Any], object]] = {
             **dict.fromkeys(PICTURES, self._picture), 'twist': self._twist,
             'command': lambda name, log, message: self._add(name, log, 0, 0, (message.data,)),
-            'joint': self._joints, 'mark': self._mark, 'signal': self._signals,
-            'object': self._objects, 'goal_object': self._objects}
+            'period': self._period, 'joint': self._joints, 'mark': self._mark,
+            'signal': self._signals, 'object': self._objects, 'goal_object': self._objects}
 
     def take(self, topic: str, kind: str, log: int, data: memoryview) -> None:
         """Take a message of a type; note it when it cannot be used."""
@@ -309,6 +310,11 @@ class _Decoder:
         linear = message.twist.linear
         self._add(name, log, to_nanoseconds(message.header.stamp), 0,
                   (linear.x, linear.y, linear.z))
+
+    def _period(self, name: str, log: int, message: Any) -> None:
+        if not 0 < message.data < np.inf:
+            raise RecordingError(f'a control period of {message.data} s')
+        self._add(name, log, 0, 0, (message.data,))
 
     def _joints(self, name: str, log: int, message: Any) -> None:
         known, stamp = decode_positions(message), to_nanoseconds(message.header.stamp)

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.base.contract import CAMERA_FRAME, WORLD_FRAME
+from tap_ros.base.contract import CAMERA_FRAME, CONTROL_PERIOD, WORLD_FRAME
 from tap_ros.base.errors import RecordingError
 from tap_ros.messages import topics
 from tap_ros.messages.images import (
@@ -53,6 +53,7 @@ class EpisodeWriter:
         self._camera_matrix = np.zeros((3, 3)) if camera_matrix is None else np.asarray(
             camera_matrix, float)
         self._last_log: int | None = None
+        self._told = False  # of what unit the commands are
         self._goals: set[topics.Topic] = set()  # topics of the goal that hold
 
     def __enter__(self) -> Self:
@@ -111,9 +112,13 @@ class EpisodeWriter:
                 'position': episode.signals[t].astype(float)})
         if t < len(episode.stamps) - 1 and not np.isnan(episode.actions[t]).all():
             x, y, z, opening = episode.actions[t].tolist()
+            if not self._told:
+                self._told = True
+                self._put(topics.CONTROL_PERIOD, stamp, {'data': CONTROL_PERIOD})
             self._put(topics.TWIST, stamp, {
                 'header': header_fields(stamp, WORLD_FRAME),
-                'twist': {'linear': {'x': x, 'y': y, 'z': z}}})
+                'twist': {'linear': {
+                    axis: way / CONTROL_PERIOD for axis, way in zip('xyz', (x, y, z))}}})
             self._put(topics.GRIPPER_COMMAND, stamp, {'data': opening})
 
     def _picture(self, topic: topics.Topic, stamp: int, picture: np.ndarray,

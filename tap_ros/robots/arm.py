@@ -3,9 +3,11 @@
 """
 An arm as data: its joints, what they carry, where it stands, and how it reaches a pose.
 
-ur10e.py and panda.py are one each. Another package adds one by the entry points 'tap_ros.arms'.
+ur10e.py and panda.py are one each, from_urdf.py makes others. Another package adds one by the
+entry points 'tap_ros.arms'.
 Frames: link 0 is the base; link i turns about its own z by joint i and carries link i + 1, and the
-last link the flange, at a place (m) that is rolled about x (rad).
+last link the flange, at a place (m) that is turned: rolled about x, or by roll, pitch and yaw
+(rad).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +27,7 @@ BASE_FRAME = 'base'  # of the arm, as its controller has it
 TIP_FRAME = 'gripper_tip'  # between the fingertips
 Colour = tuple[float, float, float]
 Place = tuple[float, float, float]
+Turn = float | Place  # roll, or roll, pitch and yaw
 DARK: Colour = (0.16, 0.17, 0.18)
 
 
@@ -78,7 +81,7 @@ class Arm:
     :param limits: (J, 2) rad, least and greatest.
     :param speeds: (J,) rad/s, highest.
     :param efforts: (J,) N m, highest.
-    :param origins: of the links 1 to J and of the flange in the link before: place, roll.
+    :param origins: of the links 1 to J and of the flange in the link before: place, turn.
     :param inverse: returns (J,) joints that bring the flange to a pose (4, 4) in the base, or
         raises KinematicsError with the reason.
     :param shapes: what it looks like.
@@ -93,7 +96,7 @@ class Arm:
     limits: np.ndarray
     speeds: np.ndarray
     efforts: tuple[float, ...]
-    origins: tuple[tuple[Place, float], ...]
+    origins: tuple[tuple[Place, Turn], ...]
     inverse: Callable[[np.ndarray], np.ndarray]
     shapes: tuple[Primitive, ...]
     mount: Mount
@@ -108,11 +111,16 @@ class Arm:
 
     def forward(self, joints: ArrayLike) -> np.ndarray:
         """Return the pose (..., 4, 4) of the flange in the base; joints (..., J) rad."""
+        return self.chain(joints)[-1]
+
+    def chain(self, joints: ArrayLike) -> list[np.ndarray]:
+        """Return the poses (..., 4, 4) of the links 1 to J and of the flange in the base."""
         joints = np.asarray(joints, np.float64)
-        pose = np.eye(4)
+        found, pose = [], np.eye(4)
         for i in range(len(self.joints)):
             pose = pose @ turned(*self.origins[i], joints[..., i])
-        return pose @ turned(*self.origins[-1], 0.0)
+            found.append(pose)
+        return [*found, pose @ turned(*self.origins[-1], 0.0)]
 
     def transforms(self, joints: ArrayLike) -> list[Transform]:
         """Return where each link is in the one before, from the base on; joints (J,) rad."""
@@ -122,10 +130,14 @@ class Arm:
     @property
     def fixed_transforms(self) -> list[Transform]:
         """Return where the base and the fingertips are, which no joint changes."""
-        (x, y, z), roll = self.origins[-1]
         return [Transform(WORLD_FRAME, BASE_FRAME, self.mount.pose),
-                Transform(self.links[-1], TIP_FRAME,
-                          turned((x, y, z + self.mount.tool), roll, 0.0))]
+                Transform(self.links[-1], TIP_FRAME, self.tip(self.mount))]
+
+    def tip(self, mount: Mount) -> np.ndarray:
+        """Return the pose (4, 4) of the fingertips in the last link."""
+        pose = turned(*self.origins[-1], 0.0)
+        pose[:3, 3] += mount.tool * pose[:3, 2]
+        return pose
 
     def gripper_at(self, joints: ArrayLike, mount: Mount | None = None) -> np.ndarray:
         """
@@ -212,13 +224,23 @@ def find_joints(positions: Mapping[str, float], arms: Sequence[Arm]) -> list[flo
     return found[0] if len(found) == 1 else None
 
 
-def turned(place: Sequence[float], roll: float, angle: ArrayLike) -> np.ndarray:
-    """Return the pose (..., 4, 4) of a frame at a place, rolled about x, then turned about z."""
+def rpy(turn: Turn) -> Place:
+    """Return roll, pitch and yaw of a turn."""
+    return turn if isinstance(turn, tuple) else (turn, 0.0, 0.0)
+
+
+def turned(place: Sequence[float], turn: Turn, angle: ArrayLike) -> np.ndarray:
+    """Return the pose (..., 4, 4) of a frame at a place, turned, then about its z by an angle."""
+    roll, pitch, yaw = rpy(turn)
     c, s, cr, sr = np.cos(angle), np.sin(angle), np.cos(roll), np.sin(roll)
     pose = np.zeros((*np.shape(angle), 4, 4))
     pose[..., 0, 0], pose[..., 0, 1] = c, -s
     pose[..., 1, 0], pose[..., 1, 1], pose[..., 1, 2] = cr * s, cr * c, -sr
     pose[..., 2, 0], pose[..., 2, 1], pose[..., 2, 2] = sr * s, sr * c, cr
+    if pitch or yaw:
+        c, s, cy, sy = np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+        pose[..., :3, :3] = np.array([
+            [cy * c, -sy, cy * s], [sy * c, cy, sy * s], [-s, 0, c]]) @ pose[..., :3, :3]
     pose[..., :3, 3], pose[..., 3, 3] = place, 1
     return pose
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from tap_ros.base.contract import WORLD_FRAME
-from tap_ros.robots.arm import Arm, BASE_FRAME, DARK, Mount, Primitive, TIP_FRAME
+from tap_ros.robots.arm import Arm, BASE_FRAME, DARK, Mount, Primitive, rpy, TIP_FRAME
 
 
 def robot_description(arm: Arm, mount: Mount | None = None,
@@ -22,7 +22,6 @@ def robot_description(arm: Arm, mount: Mount | None = None,
         of the link TIP_FRAME.
     """
     mount = mount or arm.mount
-    *origins, ((x, y, z), tip_roll) = arm.origins
     shapes = {WORLD_FRAME: [], TIP_FRAME: [], **{
         name: [shape for shape in arm.shapes if shape.link == number]
         for number, name in enumerate(arm.links)}}
@@ -34,15 +33,16 @@ def robot_description(arm: Arm, mount: Mount | None = None,
                   '</link>']
     joints = [('world_joint', 'fixed', WORLD_FRAME, BASE_FRAME,
                _origin(mount.position, (0, 0, mount.yaw)))]
-    for i, (place, roll) in enumerate(origins):
+    *origins, (_, tip_turn) = arm.origins
+    for i, (place, turn) in enumerate(origins):
         low, high, speed, effort = (_text([number]) for number in (
             *arm.limits[i], arm.speeds[i], arm.efforts[i]))
         joints.append((
             arm.joints[i], 'revolute', arm.links[i], arm.links[i + 1],
-            f'{_origin(place, (roll, 0, 0))}<axis xyz="0 0 1"/><limit lower="{low}" '
+            f'{_origin(place, rpy(turn))}<axis xyz="0 0 1"/><limit lower="{low}" '
             f'upper="{high}" velocity="{speed}" effort="{effort}"/>'))
     joints.append(('gripper_joint', 'fixed', arm.links[-1], TIP_FRAME,
-                   _origin((x, y, z + mount.tool), (tip_roll, 0, 0))))
+                   _origin(arm.tip(mount)[:3, 3], rpy(tip_turn))))
     parts += [f'<joint name="{name}" type="{kind}"><parent link="{parent}"/>'
               f'<child link="{child}"/>{inside}</joint>'
               for name, kind, parent, child, inside in joints]

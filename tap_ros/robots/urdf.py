@@ -7,7 +7,8 @@ Only collision geometry of boxes, cylinders, spheres and capsules is read. Each 
 of a convex polyhedron that just contains it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from itertools import product
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -25,7 +26,7 @@ SHAPES = ('box', 'cylinder', 'sphere', 'capsule')
 _READ = {'robot': ('link', 'joint'), 'link': ('collision',),
          'joint': ('parent', 'child', 'origin', 'axis'), 'collision': ('origin', 'geometry')}
 _NUMBERS = ('xyz', 'rpy', 'size', 'radius', 'length', 'multiplier', 'offset')
-_LINK = 'link '  # before names of links: a root named world would be MuJoCo's own
+LINK = 'link '  # before names of links: a root named world would be MuJoCo's own
 _SIDES = 24  # of a circle
 
 
@@ -53,14 +54,11 @@ class Robot:
     :ivar shapes: of all links.
     """
 
-    def __init__(self, spec: mujoco.MjSpec, mimics: Mapping[str, Mimic]) -> None:
-        spec.compiler.fusestatic = False
-        spec.compiler.boundmass = spec.compiler.boundinertia = 1  # nobody asks for the true ones
-        self._model = model = spec.compile()
-        self._data = mujoco.MjData(model)
+    def __init__(self, model: mujoco.MjModel, mimics: Mapping[str, Mimic]) -> None:
+        self._model, self._data = model, mujoco.MjData(model)
         self._joints = [mimics.get(name, Mimic(name)) for name in (
             model.joint(i).name for i in range(model.njnt))]
-        self.links = tuple(model.body(i).name.removeprefix(_LINK) for i in range(1, model.nbody))
+        self.links = tuple(model.body(i).name.removeprefix(LINK) for i in range(1, model.nbody))
         self.positions = tuple(dict.fromkeys(joint.leader for joint in self._joints))
         self.shapes = tuple(Shape(self.links[model.geom_bodyid[i] - 1], _corners(model, i))
                             for i in range(model.ngeom))
@@ -103,27 +101,46 @@ def read_urdf(text: str, source: str) -> Robot:
     :param source: what errors call it.
     :raises ConfigError: when it cannot be used, for example since a shape is a mesh.
     """
-    if len(text) > MOST_CHARACTERS:
-        raise ConfigError(f'{source}: has {len(text)} characters; at most {MOST_CHARACTERS} are '
-                          'read')
+    with reading(source):
+        robot = parse(text)
+        mimics = checked(robot)
+        _check_shapes(robot)
+        return Robot(compiled(robot), mimics)
+
+
+@contextmanager
+def reading(source: str) -> Iterator[None]:
+    """Turn what goes wrong while a URDF is read into a ConfigError that names it."""
     try:
-        # Bytes, since text that declares its encoding is refused.
-        robot = ElementTree.fromstring(text.encode('utf-8', 'replace'))
-        mimics = _checked(robot)
-        for element in robot.iter():
-            element[:] = [child for child in element
-                          if child.tag in _READ.get(element.tag, (child.tag,))]
-            name = 'name' if element.tag == 'link' else 'link'
-            if element.tag in ('link', 'parent', 'child'):
-                element.set(name, _LINK + element.get(name, ''))
-        return Robot(mujoco.MjSpec.from_string(ElementTree.tostring(robot, 'unicode')), mimics)
+        yield
     except ConfigError as error:
         raise ConfigError(f'{source}: {error}') from error
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
         raise ConfigError(f'{source}: is no URDF: {escaped(error)}') from error
 
 
-def _checked(robot: ElementTree.Element) -> dict[str, Mimic]:
+def parse(text: str) -> ElementTree.Element:
+    """Return the root element of XML of a bounded size."""
+    if len(text) > MOST_CHARACTERS:
+        raise ConfigError(f'has {len(text)} characters; at most {MOST_CHARACTERS} are read')
+    return ElementTree.fromstring(text.encode('utf-8', 'replace'))  # text may name an encoding
+
+
+def compiled(robot: ElementTree.Element) -> mujoco.MjModel:
+    """Return the links, joints and collision shapes of a checked robot, which is changed."""
+    for element in robot.iter():
+        element[:] = [child for child in element
+                      if child.tag in _READ.get(element.tag, (child.tag,))]
+        name = 'name' if element.tag == 'link' else 'link'
+        if element.tag in ('link', 'parent', 'child'):
+            element.set(name, LINK + element.get(name, ''))
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, 'unicode'))
+    spec.compiler.fusestatic = False
+    spec.compiler.boundmass = spec.compiler.boundinertia = 1  # nobody asks for the true ones
+    return spec.compile()
+
+
+def checked(robot: ElementTree.Element) -> dict[str, Mimic]:
     """Refuse what MuJoCo takes otherwise than it is meant; return which joints follow others."""
     links = [link.get('name') for link in robot.iterfind('link')]
     if robot.tag != 'robot' or not links:
@@ -135,6 +152,11 @@ def _checked(robot: ElementTree.Element) -> dict[str, Mimic]:
             if not np.isfinite([float(word) for word in element.attrib[name].split()]).all():
                 raise ConfigError(f'{name}="{escaped(element.attrib[name], 60)}"; expected '
                                   'numbers')
+    return _checked_joints(robot, links)
+
+
+def _check_shapes(robot: ElementTree.Element) -> None:
+    """Refuse shapes that are not read."""
     shapes = [(link.get('name'), next(collision.iterfind('geometry/*'), None)) for link in
               robot.iterfind('link') for collision in link.iterfind('collision')]
     if not 0 < len(shapes) <= MOST_SHAPES:
@@ -144,6 +166,10 @@ def _checked(robot: ElementTree.Element) -> dict[str, Mimic]:
             kind = 'shape that is missing' if shape is None else escaped(shape.tag)
             raise ConfigError(f'link {escaped(link)} has a {kind}; expected {", ".join(SHAPES)}: '
                               'replace meshes by such shapes')
+
+
+def _checked_joints(robot: ElementTree.Element, links: list[str | None]) -> dict[str, Mimic]:
+    """Refuse what is no tree; return which joints follow others."""
     children, mimics = [], {}
     joints = {joint.get('name', ''): joint for joint in robot.iterfind('joint')}
     for name, joint in joints.items():

@@ -19,7 +19,7 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from tap_ros.base import plugins
-from tap_ros.base.contract import ROBOT_MASKS
+from tap_ros.base.contract import CONTROL_PERIOD, ROBOT_MASKS
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import listing
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
@@ -51,6 +51,8 @@ class Shared:
     :param robot_mask: What camera/robot_mask takes out of the pictures: nothing (none), the arm
         with its shadow (arm), or the whole robot (all). What was seen there free last takes its
         place.
+    :param control_period: Seconds (of image stamps) that the arm takes for one command: it moves
+        by its velocity times this.
     :param joint_prefix: What the names of the robot's joints begin with in joint_states, before
         shoulder_pan_joint and so on.
     :param arm: The arm. Heeded, as where it stands, where joint_states has its joints and not
@@ -63,6 +65,7 @@ class Shared:
     device: str = setting('cpu', choices=('cpu', 'cuda'))
     image_transport: str = setting('raw', choices=('raw', 'compressed'))
     robot_mask: str = setting('none', choices=ROBOT_MASKS)
+    control_period: float = setting(CONTROL_PERIOD, between=(0.05, 10.0))
     joint_prefix: str = ''
     arm: str = setting(DEFAULT_ARM, plugins='tap_ros.arms')
     fixed_opening: float = setting(0.0, between=(0.0, 1.0))
@@ -93,8 +96,9 @@ class CameraParameters:
     Where the camera is, and what counts of its camera_info.
 
     :param camera_x: x of the camera in the world, for robot_mask_node in base_frame, m.
-    :param camera_y: y of the camera, m; likewise.
-    :param camera_z: z of the camera, m; likewise. With 0 tracker_node takes camera/pose.
+    :param camera_y: y of the camera in that frame, m.
+    :param camera_z: z of the camera in that frame, m. With 0 tracker_node takes camera/pose, or
+        the pose that tf_static tells; robot_mask_node does with x, y and z of 0.
     :param camera_qx: x of the quaternion that turns the camera's optical frame (z forward, x
         right, y down in the picture) into that frame.
     :param camera_qy: y of that quaternion.

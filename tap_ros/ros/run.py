@@ -15,7 +15,7 @@ from typing import Any
 import rclpy
 from rclpy import executors
 from rclpy.signals import SignalHandlerOptions
-from tap_ros.base.contract import NODE_CLASSES
+from tap_ros.base.contract import NODE_CLASSES, OWNED
 from tap_ros.base.errors import TapError
 from tap_ros.base.text import escaped, listing
 from tap_ros.ros.calls import log_error, spin_once
@@ -65,6 +65,8 @@ def main(name: str = '', args: list[str] | None = None) -> int:
     code = 0
     try:
         _handle_signals(end)
+        if os.environ.pop(OWNED, ''):
+            threading.Thread(target=_end_with_owner, name='owner watch', daemon=True).start()
         configure_fast_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = node_class(automatically_declare_parameters_from_overrides=True)
@@ -145,6 +147,13 @@ def configure_fast_dds(environ: MutableMapping[str, str] = os.environ) -> None:
     if profile is LOCALHOST:  # rmw_fastrtps leaves the system's default alone
         environ.pop(LOCALHOST_ONLY, None)
         environ[RANGE] = 'SYSTEM_DEFAULT'
+
+
+def _end_with_owner() -> None:
+    """End this process as SIGTERM does once its owner, who holds its standard input, is gone."""
+    while os.read(sys.stdin.fileno(), 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _handle_signals(handler: Callable[[int, Any], Any]) -> None:

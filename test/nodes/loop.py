@@ -18,6 +18,7 @@ from std_msgs.msg import Float64
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 import tap_ros
+from tap_ros.base.contract import CONTROL_PERIOD
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.planning.mpc_config import with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
@@ -114,8 +115,8 @@ class Loop:
         return reaching
 
     def moves(self):
-        """Return the commands (N, 3) so far, without the stops."""
-        return np.array([
+        """Return the commands (N, 3) so far, m in a control period, without the stops."""
+        return CONTROL_PERIOD * np.array([
             [t.twist.linear.x, t.twist.linear.y, t.twist.linear.z]
             for t in list(self.twists) if to_nanoseconds(t.header.stamp)])
 

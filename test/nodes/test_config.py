@@ -8,10 +8,15 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import time
 
+from driven import Arm, goal_fields, World
+from processes import Client, until
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
+import tap_ros
+from tap_ros.apps.node_processes import errors_in
 from tap_ros.base.contract import CLIMB_LIMIT, MOVE_LIMIT, NODE_CLASSES
 from tap_ros.ros.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
 import yaml
@@ -83,17 +88,16 @@ from tap_ros.apps.node_processes import NodeProcesses
 with NodeProcesses(sys.argv[1]) as processes:
     processes.start('robot_mask_node')
     print(processes._processes['robot_mask_node'].pid, flush=True)
-    time.sleep(60)
+    time.sleep(600)
 """
 
 
 def lives(pid):
-    """Return whether there is such a process."""
+    """Return whether such a process runs; one that nobody has waited for does not."""
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except (FileNotFoundError, ProcessLookupError):
         return False
-    return True
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
@@ -106,3 +110,26 @@ def test_no_node_outlives_the_command_that_started_it(number, tmp_path):
     command.send_signal(number)
     assert command.wait(30) == 128 + number
     assert not lives(node)
+
+
+@pytest.mark.slow
+def test_a_planner_stops_the_arm_and_ends_when_who_started_it_is_killed(tmp_path):
+    code = COMMAND.replace('robot_mask_node', 'visual_mpc_node')
+    with (subprocess.Popen([sys.executable, '-c', code, str(tmp_path)], stdout=subprocess.PIPE,
+                           text=True) as command,
+          Client() as node, World(node), tap_ros.Client(node=node) as client):
+        planner, arm = int(command.stdout.readline()), Arm(node)
+        try:
+            client.wait_until_ready('visual_mpc_node', timeout_s=60)
+            next(iter(client.reach(**goal_fields())))  # it moves
+            moment = time.monotonic()
+            command.kill()
+            assert until(lambda: not lives(planner))
+            assert arm.moves(0)
+            arm.assert_stopped(moment)
+        finally:
+            command.kill()
+            if lives(planner):
+                os.kill(planner, signal.SIGKILL)
+    log = (tmp_path / 'visual_mpc_node.log').read_text()
+    assert 'reach_goal ended' in log and not errors_in(log), log

@@ -117,7 +117,7 @@ def test_no_bag_is_overwritten_and_each_has_the_goal_and_the_cards(client, recor
     assert node.end() == 0
     assert [path.name for path in (tmp_path / 'bag').iterdir()] == ['precious.txt']
     assert {topic for topic, _, _ in read(tmp_path / 'bag-3')} == {
-        '/goal/image', '/predictor_node/model_card'}
+        '/arm/control_period', '/goal/image', '/predictor_node/model_card'}
     for name, pictures in (('bag-2', [1, 2]), ('bag-3', [2])):
         found = {}
         for topic, _, message in read(tmp_path / name):
@@ -128,19 +128,21 @@ def test_no_bag_is_overwritten_and_each_has_the_goal_and_the_cards(client, recor
             bytes(random_image(stamp).data) for stamp in pictures]
 
 
-def test_topics_of_any_type_can_be_recorded_and_where_the_arm_stands(client, record, tmp_path):
+def test_topics_of_any_type_can_be_recorded_beside_where_the_arm_stands_and_its_time(
+        client, record, tmp_path):
     joints = client.create_publisher(JointState, 'elsewhere/joints', STREAM)
     robot = client.create_publisher(String, 'robot_description', LATCHED)
     robot.publish(String(data='<robot/>'))  # before the recorder is there
     node = record(topics=['elsewhere/joints', 'robot_description'], compression='none',
-                  mount_x=0.25, fixed_opening=0.5)
+                  mount_x=0.25, fixed_opening=0.5, control_period=0.5)
     assert until(joints.get_subscription_count)
     joints.publish(JointState(name=['a'], position=[1.5]))
     arrived(joints, robot)
     assert until(lambda: node.node._bags.count == 2)
     assert node.end() == 0
     found = {topic: (kind, message) for topic, kind, message in read(tmp_path / 'bag')}
-    assert sorted(found) == ['/elsewhere/joints', '/robot_description']
+    assert sorted(found) == ['/arm/control_period', '/elsewhere/joints', '/robot_description']
+    assert found['/arm/control_period'][1].data == 0.5
     kind, message = found['/elsewhere/joints']
     assert kind == 'sensor_msgs/msg/JointState'
     assert message.name == ['a'] and message.position.tolist() == [1.5]

@@ -4,7 +4,8 @@
 
 import time
 
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import Twist, TwistStamped, Vector3
+from made_bags import decode_gripper
 import numpy as np
 from processes import Client, Newest, NodeProcess, until
 import pytest
@@ -18,6 +19,7 @@ from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import StepScene
 import tap_ros
+from tap_ros.base.contract import CONTROL_PERIOD
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.calls import CallError
@@ -70,10 +72,12 @@ class Rig:
         return to_nanoseconds(self.client.call('step', num_periods=periods).stamp)
 
     def send(self, x=0.0, y=0.0, z=0.0, stamp=None):
+        """Send a command that moves so many metres."""
         message = TwistStamped()
         if stamp is not None:
             message.header.stamp = stamp
-        message.twist.linear.x, message.twist.linear.y, message.twist.linear.z = x, y, z
+        message.twist.linear = Vector3(
+            x=x / CONTROL_PERIOD, y=y / CONTROL_PERIOD, z=z / CONTROL_PERIOD)
         self.twist.publish(message)
 
     def act(self, **move):
@@ -118,6 +122,22 @@ def test_everything_about_one_moment_has_the_same_stamp(rig):
             assert Newest(node, kind, topic, STREAM).wait(20).header.stamp == stamp
         for kind, topic in ((Image, 'goal/image'), (ObjectStates, 'goal/objects')):
             assert Newest(node, kind, topic, LATCHED).wait(10).header.stamp == start.header.stamp
+
+
+def test_a_command_is_a_velocity_that_lasts_for_a_control_period(rig):
+    assert Newest(rig.node, Float64, 'arm/control_period', LATCHED).wait(10).data == CONTROL_PERIOD
+    rig.reset(seed=5)
+    sim = Simulator('push2')
+    sim.reset(5)
+    for command, way in ((Vector3(x=0.2, y=-0.1, z=0.3), [0.05, -0.025, 0.075]),
+                         (Vector3(x=-1e300, y=3.0), [-0.08, 0.08, 0])):  # m/s, m
+        before = rig.image.wait(10).header
+        rig.twist.publish(TwistStamped(header=before, twist=Twist(linear=command)))
+        stamp = to_stamp(to_nanoseconds(before.stamp) + PERIOD_NS)
+        then = rig.joints.wait(10, lambda m, stamp=stamp: m.header.stamp == stamp)
+        assert np.array_equal(decode_gripper(then), sim.step(np.append(way, 0)).gripper)
+    rig.process.wait_for('m/s')
+    sim.close()
 
 
 def test_a_goal_that_is_moved_is_published_as_that_of_a_reset(rig):
@@ -239,7 +259,7 @@ def test_in_real_time_the_clock_runs_unless_paused_and_old_commands_move_nothing
                 later(images, images.wait(20), 2)  # so the node has the time-out first
                 before = joints.wait(10)
                 command = TwistStamped(header=images.wait(1).header)
-                command.twist.linear.x = 0.05 if before.position[0] < 0 else -0.05
+                command.twist.linear.x = 0.2 if before.position[0] < 0 else -0.2
                 twists.publish(command)
                 begin = before.position[0]
                 if timeout < 1:

@@ -9,10 +9,12 @@ from driven import Arm, first_pictures, goal_fields, TOPICS, World
 from processes import Client, LocalNode, until
 import pytest
 from rclpy.parameter import Parameter
+from std_msgs.msg import Float64
 import tap_ros
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.planning.reach import MOST_REFUSED
 from tap_ros.planning.visual_mpc import Scene
+from tap_ros.ros.topics import LATCHED
 
 pytestmark = pytest.mark.slow
 
@@ -97,6 +99,19 @@ def test_drivers_that_repeat_one_stamp_move_nothing_unless_a_clock_stands_still(
     now = time.time_ns()
     rig.world.frozen, rig.world.clock_ns = dict.fromkeys(TOPICS, now), now
     _, moves = rig.reach(1, image_timeout=5.0)  # then nothing new comes
+    assert moves == 1
+
+
+def test_an_arm_that_takes_another_time_for_a_command_is_not_moved(rig):
+    arm = rig.client.node.create_publisher(Float64, 'arm/control_period', LATCHED)
+    assert until(arm.get_subscription_count)
+    for period in (float('nan'), 0.5):
+        arm.publish(Float64(data=period))
+    assert until(lambda: rig.planner.node._arm._period == 0.5)
+    rig.aborted('by arm/control_period the arm takes 0.5 s')
+    arm.publish(Float64(data=0.25))
+    assert until(lambda: rig.planner.node._arm._period == 0.25)
+    _, moves = rig.reach(1)
     assert moves == 1
 
 

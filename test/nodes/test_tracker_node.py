@@ -6,13 +6,22 @@ import json
 import math
 from threading import Event
 import time
+from types import SimpleNamespace
 
 from driven import SEED, select
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import (
+    PoseStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    TwistStamped,
+    Vector3,
+)
 import numpy as np
 from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
 from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 from tap_msgs.msg import Episode, ObjectStates
 import tap_ros
 from tap_ros.apps.explorer.node import ExplorerNode
@@ -64,9 +73,10 @@ class Scene:
         return dict(zip(names, pixels.tolist()))
 
     def move(self, *move):
-        """Let one control period pass; return the stamp of the next picture."""
+        """Move so many metres in one control period; return the stamp of the next picture."""
         command = TwistStamped(header=self.image.wait(10).header)
-        command.twist.linear.x, command.twist.linear.y, command.twist.linear.z = move
+        x, y, z = np.array(move) / CONTROL_PERIOD
+        command.twist.linear = Vector3(x=x, y=y, z=z)
         self.twist.publish(command)
         return to_nanoseconds(command.header.stamp) + round(CONTROL_PERIOD * 1e9)
 
@@ -289,6 +299,29 @@ def test_requests_of_no_use_are_refused_with_the_remedy(client):
         assert until(lambda: client.count_publishers('/asked/camera/image_raw') == 2)
         why = eye.ask(names=['a'], u=[65.0], v=[50.0])
         assert '/test_client, /second_eye' in why or '/second_eye, /test_client' in why
+
+
+def test_the_camera_is_where_tf_says_unless_its_topic_does(client):
+    with Eye(client, 'framed') as eye:
+        inputs, size = eye.node.node._inputs, (SIZE, SIZE)
+
+        def told(turn):
+            place, turn = Vector3(y=-1.1, z=1.3), Quaternion(**dict(zip('xyzw', turn)))
+            inputs._frames._take(SimpleNamespace(transforms=[TransformStamped(
+                header=Header(frame_id='world'), child_frame_id='eye',
+                transform=Transform(translation=place, rotation=turn))]))
+
+        told((0.94, 0.0, 0.0, -0.34))
+        assert inputs.calibration(size) == (None, None), 'nothing tells which frame is the camera'
+        inputs.info = encode_camera_info(
+            np.array([[140.0, 0, 63.5], [0, 140, 63.5], [0, 0, 1]]), size, to_stamp(1), 'eye')
+        by_tf, _ = inputs.calibration(size)
+        told((0.0, 0.0, 0.0, 1.0))
+        with pytest.raises(TapError, match='^tf_static: .* look down'):
+            inputs.calibration(size)
+        eye.calibrate()
+        by_topic, _ = inputs.calibration(size)
+        assert by_topic.apart(by_tf) < 1e-6
 
 
 @pytest.mark.parametrize('change, words', [

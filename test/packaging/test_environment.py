@@ -33,6 +33,15 @@ def test_the_environment_can_be_entered_by_any_shell(options):
     assert ('u' in done.stdout.split('left ')[1]) == ('u' in options and '+' not in options)
 
 
+def test_the_ros2_command_says_how_to_get_it_until_it_is_there():
+    if (ROOT / 'ros2').exists() or not (ROOT / '.venv' / 'bin' / 'activate').is_file():
+        pytest.skip('it is there, or installed without make')
+    line = '. scripts/environment.bash; . scripts/environment.bash; ros2 topic list'
+    done = subprocess.run(['bash', '-c', line], cwd=ROOT, text=True, capture_output=True,
+                          env={'PATH': os.defpath})
+    assert done.returncode == 127 and 'make ros2' in done.stderr, done.stderr
+
+
 @pytest.mark.parametrize('value', ['disabled', pytest.param('osmesa', marks=pytest.mark.skipif(
     find_library('OSMesa') is not None, reason='OSMesa is installed'))])
 def test_without_opengl_physics_runs_and_pictures_are_refused_in_one_line(value):

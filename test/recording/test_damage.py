@@ -141,7 +141,7 @@ def test_a_missing_chunk_is_named_with_its_place_and_its_messages(chunked):
     path, episodes = chunked
     data = path.read_bytes()
     chunks = [(start, end) for kind, start, end in records(data) if kind == CHUNK]
-    start, end = chunks[len(chunks) // 2]
+    start, end = chunks[len(chunks) // 2 + 1]
     path.write_bytes(data[:start] + bytes(end - start) + data[end:])
     assert check_damaged(path, episodes) == 'part'
     found, texts = read(path)

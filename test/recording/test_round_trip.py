@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from tap_ros.base.contract import CONTROL_PERIOD
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 import yaml
@@ -69,7 +70,8 @@ def test_others_read_the_bag(bag, episodes):
         qos = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
     np.testing.assert_array_equal(frames, np.concatenate([e.frames for e in episodes]))
     np.testing.assert_array_equal(
-        np.float32(twists), np.concatenate([e.actions[:-1, :3] for e in episodes]))
+        np.float32(CONTROL_PERIOD * np.array(twists)),
+        np.concatenate([e.actions[:-1, :3] for e in episodes]))
     assert ends == [(e.task, e.seed, e.outcome) for e in episodes]
     assert qos['/goal/image'].durability.name == 'TRANSIENT_LOCAL'
     assert qos['/camera/image_raw'].durability.name == 'VOLATILE'

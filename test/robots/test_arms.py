@@ -11,13 +11,35 @@ from sim_bridge.simulator import Simulator
 from tap_ros.base import plugins
 from tap_ros.base.contract import CONTROL_PERIOD, ROBOT_MASK_ARM
 from tap_ros.base.errors import ConfigError, KinematicsError
-from tap_ros.robots.arm import find_joints, get_arm, known_arms, TIP_FRAME
+from tap_ros.robots.arm import find_joints, get_arm, known_arms, TIP_FRAME, turned
 from tap_ros.robots.description import robot_description
+from tap_ros.robots.from_urdf import arm_from_urdf, origin_of
 from tap_ros.robots.ur10e import UR10E
 from tap_ros.robots.urdf import read_urdf
 from test_urdf import in_mujoco
 
-ARMS = [get_arm(name) for name in plugins.names('tap_ros.arms')]
+OFFSETS = np.array([0.3, -0.8, 0.5, 1.1, -0.4, 0.7])
+
+
+def found(arm):
+    """Return an arm as its URDF tells it, whose inverse kinematics is a search."""
+    middle = (np.array(arm.low) + arm.high) / 2
+    return arm_from_urdf(
+        f'{arm.name}_found', robot_description(arm), arm.joints, TIP_FRAME,
+        arm.joints_at(middle), replace(arm.mount, tool=0.0), low=arm.low, high=arm.high,
+        action_limit=arm.action_limit)
+
+
+def crooked():
+    """Return the UR10e with zeros of its joints elsewhere, so that frames have three angles."""
+    origins = [*(origin_of(turned(*origin, offset)) for origin, offset in zip(
+        UR10E.origins, OFFSETS)), UR10E.origins[-1]]
+    return replace(UR10E, name='crooked', origins=tuple(origins), limits=2 * UR10E.limits,
+                   inverse=lambda pose: UR10E.inverse(pose) - OFFSETS)
+
+
+KNOWN = [get_arm(name) for name in plugins.names('tap_ros.arms')]
+ARMS = [*KNOWN, *map(found, KNOWN), crooked()]
 each_arm = pytest.mark.parametrize('arm', ARMS, ids=lambda arm: arm.name)
 
 
@@ -35,6 +57,12 @@ def test_the_hand_points_down_wherever_the_gripper_may_be(arm):
     flange = arm.mount.pose @ arm.forward(joints)
     assert np.allclose(flange[:, :3, :3], np.diag([1, -1, -1]), atol=1e-9)
     assert (joints >= arm.limits[:, 0]).all() and (joints <= arm.limits[:, 1]).all()
+
+
+def test_the_search_finds_what_the_closed_form_says():
+    arm = found(UR10E)
+    for place in places(arm, 50, seed=2):
+        np.testing.assert_allclose(arm.joints_at(place), UR10E.joints_at(place), atol=1e-6)
 
 
 @each_arm
@@ -65,15 +93,19 @@ def test_urdf_transforms_and_kinematics_agree(arm):
 
 def test_another_package_adds_an_arm_in_a_few_lines(monkeypatch):
     taller = replace(UR10E, name='taller', mount=replace(UR10E.mount, position=(0.0, 0.7, 0.1)))
-    monkeypatch.setattr(plugins, 'taller', taller, raising=False)
-    monkeypatch.setitem(plugins.BUILT_IN['tap_ros.arms'], 'taller', 'tap_ros.base.plugins:taller')
-    masks = []
-    for name in ('panda', 'taller', 'ur10e'):
+    for arm in (taller, found(UR10E), crooked()):
+        monkeypatch.setattr(plugins, arm.name, arm, raising=False)
+        monkeypatch.setitem(plugins.BUILT_IN['tap_ros.arms'], arm.name,
+                            f'tap_ros.base.plugins:{arm.name}')
+    masks = {}
+    for name in ('panda', 'taller', 'ur10e', 'ur10e_found', 'crooked'):
         simulator = Simulator('push2', 64, 'arm', arm=name)
-        masks.append(simulator.reset(0).robot_mask)
+        masks[name] = simulator.reset(0).robot_mask == ROBOT_MASK_ARM
         simulator.close()
-        assert (masks[-1] == ROBOT_MASK_ARM).mean() > 0.02, name
-    assert (masks[1] != masks[2]).any()
+        assert masks[name].mean() > 0.02, name
+    assert (masks['taller'] != masks['ur10e']).any()
+    assert (masks['crooked'] == masks['ur10e']).mean() > 0.999
+    assert (masks['ur10e_found'] == masks['ur10e']).mean() > 0.95  # it is thinner
     with pytest.raises(ConfigError, match="did you mean 'panda'"):
         Simulator(arm='pandas')
 

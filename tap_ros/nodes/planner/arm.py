@@ -15,6 +15,8 @@ from rclpy.node import Node
 from std_msgs.msg import Float64
 from tap_ros.base.errors import PlanningError
 from tap_ros.base.text import escaped
+from tap_ros.messages.topics import CONTROL_PERIOD
+from tap_ros.nodes.planner.settings import check_period, step_limits
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.parameters import Parameters
 from tap_ros.ros.topics import LATCHED, STREAM
@@ -44,14 +46,22 @@ class ArmCommander:
         self._ticked_at, self._stood_s = now_awake(), 0.0
         self._gripper = node.create_publisher(Float64, 'gripper/command', STREAM)
         self._twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
-        self._timeout = node.create_publisher(Float64, 'arm/command_timeout', LATCHED)
-        self._timeout.publish(Float64(data=params['command_timeout']))
+        for name in ('command_timeout', 'control_period'):
+            node.create_publisher(Float64, f'arm/{name}', LATCHED).publish(
+                Float64(data=params[name]))
+        self._period = params['control_period']  # as the arm says, or as it is told
+        node.create_subscription(Float64, CONTROL_PERIOD.name, self._on_period, LATCHED)
         self._closed = False
         self._thread = threading.Thread(target=self._watch, name='arm watch', daemon=True)
         self._thread.start()
 
     def begin(self, goal: object) -> None:
-        """Let this goal (any object), and no other, move the arm from now on."""
+        """
+        Let this goal (any object), and no other, move the arm from now on.
+
+        :raises ConfigError: when the arm takes another time for a command than is planned with.
+        """
+        check_period(self._params, self._period)
         with self._lock:
             if self._closed:
                 return
@@ -78,7 +88,8 @@ class ArmCommander:
         Send one command, clipped to the limits.
 
         :param goal: as given to begin.
-        :param action: (4,) metres moved in one control period, and gripper opening 0..1.
+        :param action: (4,) metres moved in one control period, and gripper opening 0..1. What is
+            sent is the velocity, m/s.
         :param stamp: builtin_interfaces/Time of the image that it answers.
         :param topics: sensors that the arm depends on until the next command.
         :param ages: whether what they tell gets old; not where time waits for commands.
@@ -90,14 +101,15 @@ class ArmCommander:
             raise PlanningError(f'the planner chose {action}; expected finite numbers')
         params = self._params
         # The planner keeps within them already.
-        limit = np.array([params['max_step_xy']] * 2 + [params['max_step_z']])
-        move = params['twist_scale'] * np.clip(np.asarray(action[:3], np.float64), -limit, limit)
+        limits = step_limits(params)
+        limit = np.array([limits.move, limits.move, limits.climb])
+        move = np.clip(np.asarray(action[:3], np.float64), -limit, limit)
         message = TwistStamped()
         message.header.stamp = (self._node.get_clock().now().to_msg()
                                 if params['stamp_with_now'] else stamp)
         message.header.frame_id = params['command_frame']
         linear = message.twist.linear
-        linear.x, linear.y, linear.z = move.tolist()
+        linear.x, linear.y, linear.z = (move / params['control_period']).tolist()
         with self._lock:
             now = time.monotonic()
             self._tick()
@@ -119,6 +131,10 @@ class ArmCommander:
             self._lock.notify()
         self._thread.join(seconds)
         self._twist.wait_for_all_acked(Duration(seconds=seconds))
+
+    def _on_period(self, message: Float64) -> None:
+        if 0 < message.data < math.inf:
+            self._period = message.data
 
     def _watch(self) -> None:
         """Stop the arm when the last command or a sensor is too old, until close."""

@@ -3,30 +3,28 @@
 """Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from rclpy.node import Node
 from tap_msgs.action import ReachGoal
 from tap_ros.base.contract import (
     CLIMB_LIMIT,
-    CONTROL_PERIOD,
     GOAL_TOLERANCE,
     MOVE_LIMIT,
+    SPEED_LIMIT,
     step_budget,
     WORLD_FRAME,
 )
 from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.base.text import escaped
 from tap_ros.planning.action_sequences import Limits
-from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
+from tap_ros.planning.mpc_config import PRESETS, SWITCHES, with_preset
 from tap_ros.planning.reach import ReachConfig
 from tap_ros.planning.visual_mpc import Scene, VisualMPC
 from tap_ros.ros.parameters import check_device, Parameters, setting
-from tap_ros.weights import FORWARD_MODEL, PREDICTORS
+from tap_ros.weights import find_forward_model, FORWARD_MODELS
 
 MODES = ('subgoal', 'direct')
-SHIPPED = ', '.join(('push', *PLANNING_TASKS))
 MAX_BUDGET = 1000
 MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
 
@@ -41,15 +39,13 @@ class PlannerParameters:
     :param solver: What searches the actions: the cross-entropy method (cem), the improved one
         (icem), or a solver of another package.
     :param arm_hidden: The arm is not in the pictures.
-    :param control_period: Seconds (of image stamps) that the arm takes for one command.
-    :param twist_scale: Factor of what is sent: 1 for metres per control period, 1 / control_period
-        for metres per second as MoveIt Servo takes them.
     :param stamp_with_now: Stamp commands with the time of sending, as MoveIt Servo wants them,
         instead of the stamp of the image that they answer.
     :param command_frame: Frame of the commands, for their header.
-    :param max_step_xy: Largest |dx| and |dy| of a command in metres; the planner knows it, from
-        the next goal on.
-    :param max_step_z: Largest |dz| of a command in metres; likewise.
+    :param max_step_xy: Largest |dx| and |dy| of a command in metres, 0.32 m/s at most; the planner
+        knows it, from the next goal on.
+    :param max_step_z: Largest |dz| of a command in metres, 0.6 m/s at most; the planner
+        knows it, from the next goal on.
     :param goal_tolerance: A goal is reached at this mean distance of the objects in pixels, a
         subgoal where the mean expected distance to its maps is so much above the least possible.
     :param switch: When to go on from a subgoal: when it is reached, or its share of the budget
@@ -59,8 +55,8 @@ class PlannerParameters:
     :param max_silence: The arm is stopped when the picture, the objects or the joints have been
         silent for so many seconds, or when the last command is so old. Has to be longer than the
         time from one picture to the next.
-    :param command_timeout: Seconds that a command is valid after it came; told to the arm on
-        arm/command_timeout.
+    :param command_timeout: Seconds after its arrival within which a command may begin; told to the
+        arm on arm/command_timeout.
     :param max_age: Seconds; what was received longer ago is not acted upon. A plan ends in time
         for that, if need be with fewer samples; in lock-step nothing ages.
     :param image_timeout: Seconds without a usable observation after which a goal is aborted.
@@ -70,8 +66,6 @@ class PlannerParameters:
     preset: str = setting('default', choices=tuple(PRESETS))
     solver: str = setting('cem', plugins='tap_ros.solvers')
     arm_hidden: bool = False
-    control_period: float = setting(CONTROL_PERIOD, between=(0.01, 10.0))
-    twist_scale: float = setting(1.0, between=(0.001, 1000.0))
     stamp_with_now: bool = False
     command_frame: str = WORLD_FRAME
     max_step_xy: float = setting(MOVE_LIMIT, between=(0.001, MOVE_LIMIT), read_only=False)
@@ -90,26 +84,15 @@ def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare_shared(
-        'autostart', 'device', 'image_transport', 'robot_mask', 'joint_prefix')
+        'autostart', 'device', 'image_transport', 'robot_mask', 'joint_prefix', 'control_period')
     parameters.declare('weights', 'push',
-                       f'A forward model: the shipped one, by its name or a task ({SHIPPED}), or '
-                       'a file (.safetensors). Can be changed while the node is unconfigured.',
+                       'A forward model: the shipped one, by its name or a task '
+                       f'({", ".join(FORWARD_MODELS)}), or a file (.safetensors). Can be '
+                       'changed while the node is unconfigured.',
                        read_only=False)
     parameters.declare_fields(PlannerParameters)
     parameters.declare_arm()
     return parameters
-
-
-def weights_file(weights: str) -> Path:
-    """
-    Return the file that the parameter weights names; a file named so can be given as './push2'.
-
-    :raises ConfigError: for the name of weights that are no forward model.
-    """
-    if weights in PREDICTORS and weights not in PLANNING_TASKS:
-        raise ConfigError(f'parameter weights: {weights} is a subgoal predictor, for '
-                          f'predictor_node; expected a forward model: a file, or {SHIPPED}')
-    return FORWARD_MODEL if weights in ('push', *PLANNING_TASKS) else Path(weights)
 
 
 def load_planner(parameters: Parameters) -> VisualMPC:
@@ -124,7 +107,7 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     config = with_preset(
         parameters['preset'], solver=parameters['solver'],
         arm_hidden=parameters['arm_hidden'] or parameters['robot_mask'] == 'all')
-    mpc = VisualMPC.load(weights_file(parameters['weights']), config, parameters['device'])
+    mpc = VisualMPC.load(find_forward_model(parameters['weights']), config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
     scene = Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels)
@@ -139,12 +122,31 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     return mpc
 
 
+def step_limits(parameters: Parameters) -> Limits:
+    """Return how far the arm may move by one command; it is never faster than SPEED_LIMIT."""
+    move, _, climb = (parameters['control_period'] * speed for speed in SPEED_LIMIT)
+    return Limits(min(parameters['max_step_xy'], move), min(parameters['max_step_z'], climb))
+
+
 def reach_config(parameters: Parameters, request: ReachGoal.Goal) -> ReachConfig:
     """Return the settings of the control loop for one goal."""
     return ReachConfig(
         request.step_budget, parameters['switch'], parameters['goal_tolerance'],
-        Limits(parameters['max_step_xy'], parameters['max_step_z']),
+        step_limits(parameters),
         parameters['max_age'], parameters['image_timeout'], rounds=parameters['subgoal_rounds'])
+
+
+def check_period(parameters: Parameters, told: float) -> None:
+    """
+    Raise ConfigError if the arm takes another time for a command than it is planned with.
+
+    :param told: seconds, the newest on arm/control_period.
+    """
+    period = parameters['control_period']
+    if not abs(told / period - 1) < 0.01:
+        raise ConfigError(f'parameter control_period is {period:g} s, but by arm/control_period '
+                          f'the arm takes {told:g} s for a command; start this node with '
+                          f'-p control_period:={told:g}')
 
 
 def check_request(request: ReachGoal.Goal) -> str:

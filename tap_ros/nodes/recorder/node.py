@@ -15,8 +15,17 @@ from std_srvs.srv import SetBool
 from tap_ros.base.errors import ConfigError, RecordingError, StorageError
 from tap_ros.base.files import free_folder
 from tap_ros.base.text import escaped
-from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
+from tap_ros.messages.topics import (
+    BY_NAME,
+    COMPRESSED_TYPE,
+    CONTROL_PERIOD,
+    default_qos,
+    IMAGE,
+    Qos,
+    Topic,
+)
 from tap_ros.recording.file_writer import BagWriter
+from tap_ros.recording.messages import encode
 from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
@@ -35,12 +44,14 @@ class Bags:
 
     :param params: Parameters of the node.
     :param report: called with the text of every failure.
+    :param period: full name of the topic that says of what unit the commands are.
     :ivar failure: why the last bag is missing or incomplete, None if it is not.
     :ivar count: messages in the last bag.
     """
 
-    def __init__(self, params: Parameters, report: Callable[[str], object]) -> None:
-        self._params, self._report = params, report
+    def __init__(self, params: Parameters, report: Callable[[str], object],
+                 period: str) -> None:
+        self._params, self._report, self._period = params, report, period
         self._writer: BagWriter | None = None
         self._last: dict[str, tuple[str, bytes, Qos]] = {}  # of latched topics
         self._unflushed = False
@@ -66,6 +77,9 @@ class Bags:
         self._writer = BagWriter(folder, compression=self._params['compression'])
         self.failure = None
         now = time.time_ns()
+        self._write(self._period, CONTROL_PERIOD.type, encode(CONTROL_PERIOD.type, {
+            'data': self._params['control_period']}), default_qos(self._period), now, now)
+        self.count = 0  # that is of nobody
         for topic, (type_name, data, qos) in self._last.items():
             try:
                 self._write(topic, type_name, data, qos, now, now)
@@ -175,7 +189,8 @@ class RecorderNode(Node):
         self._diagnostics = Diagnostics(
             self, streams, set(self._wanted) - streams,
             expected=self._wanted if self.params['topics'] != [*BY_NAME] else ())
-        self._bags = Bags(self.params, self._report)
+        self._bags = Bags(self.params, self._report,
+                          self.resolve_topic_name(CONTROL_PERIOD.name))
         if self.params['record_on_start']:
             self._bags.start()
         self._subscribe_known()
@@ -285,6 +300,6 @@ def declare_parameters(node: Node) -> Parameters:
     parameters = Parameters(node)
     parameters.declare_fields(RecorderParameters)
     parameters.declare('topics', list(BY_NAME), 'Topics to record.')
-    parameters.declare_shared('image_transport')
+    parameters.declare_shared('image_transport', 'control_period')
     parameters.declare_arm()
     return parameters

@@ -25,6 +25,7 @@ from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
 from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
 from tap_ros.ros.calls import log_error
 from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.frames import FixedFrames
 from tap_ros.ros.observations import reception_time
 from tap_ros.ros.parameters import CameraParameters, declared_mount, Parameters, setting
 from tap_ros.ros.subscriptions import (
@@ -52,7 +53,8 @@ class RobotMaskNode(Node):
         super().__init__('robot_mask_node', **options)
         self.params = declare_parameters(self)
         self._light = declared_light(self.params)
-        self._camera = self.params.camera_pose()
+        self._camera = self.params.camera_pose()  # at the base itself there is none: as tf tells
+        self._frames = FixedFrames(self) if not self._camera[:3, 3].any() else None
         # CameraInfo of pictures that have no mask yet, and when they were received.
         self._waiting: deque[tuple[CameraInfo, float]] = deque(maxlen=WAITING)
         self._robot: Robot | None = None
@@ -155,10 +157,22 @@ class RobotMaskNode(Node):
         for shape, label in zip(robot.shapes, self._labels):
             pose = to_base @ poses[shape.link]
             bodies.append(Body(shape.corners @ pose[:3, :3].T + pose[:3, 3], label))
-        view = PinholeCamera(K, size, self._camera)
+        view = PinholeCamera(K, size, self._camera_in_base(info.header.frame_id))
         mask = draw_mask(bodies, view, self.params['dilation'], self._light)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'mask')
         return mask
+
+    def _camera_in_base(self, frame: str) -> np.ndarray:
+        """Return the pose (4, 4) of a camera, by parameters or tf; ImageError without any."""
+        if self._frames is None:
+            return self._camera
+        pose = self._frames.pose(frame, self._base)
+        if pose is None:
+            raise ImageError(
+                f'nothing tells where the camera is: set camera_x to camera_qw, or publish on '
+                f'tf_static where {escaped(frame)!r} is in {escaped(self._base)}; that needs the '
+                'package tf2_msgs here, too')
+        return pose
 
     def _report(self, error: object) -> None:
         """Log why a picture has no mask, at most every 5 s."""

@@ -13,6 +13,7 @@ import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import Episode
+from tap_ros.base.contract import WORLD_FRAME
 from tap_ros.base.errors import ImageError, KinematicsError, TapError, TrackingError
 from tap_ros.images.robot_mask import hidden_pixels
 from tap_ros.messages.images import decode_camera_info, decode_image, decode_mask
@@ -21,6 +22,7 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE, JOINT_STATES
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.frames import FixedFrames
 from tap_ros.ros.observations import JUMP_NS, Moment, Observations, reception_time
 from tap_ros.ros.parameters import declared_arm, Parameters, pose_matrix
 from tap_ros.ros.subscriptions import adapt_regularly, AdaptiveSubscription, publishers_of
@@ -48,6 +50,7 @@ class TrackerInputs:
             check_pose(self._mounted)
         self.info: CameraInfo | None = None
         self.pose: PoseStamped | None = None  # of the camera, as a topic tells
+        self._frames = FixedFrames(node)
         self.episode = 0, 0  # stamp at which the newest known of began; jumps until then
         self._gripper = GripperHistory(
             declared_arm(params), params['joint_prefix'], params['fixed_opening'])
@@ -148,20 +151,13 @@ class TrackerInputs:
         """
         Return the calibrated camera for pictures of a size (height, width); None without a pose.
 
-        The pose is that of the parameters, else of camera/pose, as the simulator tells it.
+        The pose is that of the parameters, else of camera/pose, as the simulator tells it, else
+        that of the frame of camera_info by tf.
 
         :raises TapError: for a pose of no use, and for a camera_info that is missing, or not that
             of these pictures.
         """
-        pose = self._mounted
-        if pose is None and self.pose is not None:
-            told = self.pose.pose
-            try:
-                pose = pose_matrix([getattr(told.position, axis) for axis in 'xyz'],
-                                   [getattr(told.orientation, axis) for axis in 'xyzw'])
-                check_pose(pose)
-            except TapError as error:
-                raise TrackingError(f'{CAMERA_POSE.name}: {error}') from error
+        pose = self._told_pose() if self._mounted is None else self._mounted
         if pose is None:
             return None, None
         if self.info is None:
@@ -173,6 +169,23 @@ class TrackerInputs:
                              '{3}x{2}'.format(*found, *size))
         camera = PinholeCamera(K, size, pose)
         return Plane(camera, size), camera
+
+    def _told_pose(self) -> np.ndarray | None:
+        """Return the pose (4, 4) of the camera as topics tell it, None if none does."""
+        source, pose = CAMERA_POSE.name, None
+        try:
+            if self.pose is not None:
+                told = self.pose.pose
+                pose = pose_matrix([getattr(told.position, axis) for axis in 'xyz'],
+                                   [getattr(told.orientation, axis) for axis in 'xyzw'])
+            elif self.info is not None:
+                source = 'tf_static'
+                pose = self._frames.pose(self.info.header.frame_id, WORLD_FRAME)
+            if pose is not None:
+                check_pose(pose)
+        except TapError as error:
+            raise TrackingError(f'{source}: {error}') from error
+        return pose
 
     def _hand(self, stamp_ns: int) -> np.ndarray | None:
         """Return the gripper's state (4,) at the time of a picture, None if it is not known."""
