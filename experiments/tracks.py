@@ -36,6 +36,7 @@ SIDE = 64  # errors are in pixels of a picture so many pixels wide
 RIGHT, WRONG = 2.0, 3.0  # px: within is right; beyond is wrong
 SOON = 3  # pictures after an occlusion in which an object should be found
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 1.0)  # of confidence
+STIRS = 8.0  # px of a film, between two labels, up to which places in between are interpolated
 STRIPS, PANEL = 6, 256  # episodes that are drawn, px a side of a panel
 # Whose sheet a camera is fitted to: objects at one height to within this.
 LEVEL = 0.002  # m
@@ -293,11 +294,19 @@ def fit_camera(episodes):
 def read_film(told, folder):
     """Read a film of the file of labels as an Episode."""
     wanted = range(told.get('first', 0), told['last'] + 1, told.get('step', 1))
-    frames = [frame for i, (_, frame) in enumerate(video_frames(Path(folder, told['film'])))
+    frames = [show() for i, (_, show) in enumerate(video_frames(Path(folder, told['film'])))
               if i in wanted]
     pixels = np.full((len(frames), len(told['objects']), 2), np.nan, np.float32)
-    for number, places in told['labels'].items():
-        pixels[wanted.index(int(number))] = [place or (np.nan, np.nan) for place in places]
+    labelled = sorted(map(int, told['labels']))
+    for number in labelled:
+        pixels[wanted.index(number)] = [
+            place or (np.nan, np.nan) for place in told['labels'][str(number)]]
+    for begin, end in zip(*[[wanted.index(number) for number in labelled][i:] for i in (0, 1)]):
+        first, last = pixels[begin], pixels[end]
+        rests = np.linalg.norm(last - first, axis=1) < STIRS
+        for t in range(begin + 1, end):
+            share = (t - begin) / (end - begin)
+            pixels[t, rests] = ((1 - share) * first + share * last)[rests]
     return make_episode(frames, np.arange(len(frames)) / 10, tuple(told['objects']),
                         object_pixels=pixels, object_source='by hand', task=told['film'])
 

@@ -12,6 +12,7 @@ import time
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+from browsing import chromium, hidden_or_over, needs_browser, opened
 import cv2
 from made_episodes import move_squares, write_bag
 import numpy as np
@@ -255,3 +256,37 @@ def test_a_second_server_of_a_file_is_refused(bag, tmp_path, capsys):
         assert main(['mark', str(bag), '--marks', str(path), '--port', '0']) == 1
     assert capsys.readouterr().err.splitlines() == [
         f'error: {path}: another process keeps it; end that one, or choose another file']
+
+
+@needs_browser
+@pytest.mark.slow
+def test_what_marks_is_in_sight_at_a_desk_and_on_a_phone_and_keys_press_what_they_are_on(
+        bag, store, tmp_path):
+    path = tmp_path / 'marks.json'
+    marking = Marking(store, [str(bag)], path, ['grasp', 'release'])
+    with serving(marking) as ask, chromium() as browser:
+        for i, (size, scheme) in enumerate((((1280, 800), 'light'), ((390, 844), 'dark'))):
+            with opened(browser, ask('').url, size, color_scheme=scheme) as page:
+                page.wait_for_function("about && document.getElementById('now').naturalWidth")
+                page.wait_for_function("document.getElementById('goal').naturalWidth")
+                assert not hidden_or_over(
+                    page, 'header', '#title', '#shown', '#time', '#names', '#accept', '#next')
+                before = page.locator('#names button').first.bounding_box()
+                page.keyboard.press('1')
+                assert 'release not yet' in page.inner_text('#title') and marking.state()[
+                    'marks'].keys() == {*range(i)}
+                assert page.locator('#names button').first.bounding_box() == before
+                page.focus('#accept')  # somebody came there by Tab
+                page.keyboard.press('Enter')
+                page.wait_for_function(f'Object.keys(state.marks).length === {i + 1}')
+                ticks = page.evaluate("""() => [...document.querySelectorAll('#ticks button')]
+                    .filter((one) => one.textContent).map((one) => {
+                        const {left, right, top} = one.getBoundingClientRect();
+                        return [top, left, right];
+                    }).sort((a, b) => a[0] - b[0] || a[1] - b[1])""")
+                assert len(ticks) > 2 and all(
+                    top != other or right <= left
+                    for (top, _, right), (other, left, _) in zip(ticks, ticks[1:]))
+                shown = page.evaluate('episode')
+                page.click('#next')
+                page.wait_for_function(f'episode !== {shown}')

@@ -6,11 +6,12 @@ from contextlib import contextmanager
 from functools import partial
 import json
 import re
-import shutil
 import signal
 import time
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
+import browsing
+from browsing import chromium, needs_browser
 from loop import SEED
 import numpy as np
 from processes import page_address, until
@@ -20,9 +21,6 @@ from tap_ros.ros.topics import STREAM
 from websockets.sync.client import connect
 
 pytestmark = pytest.mark.slow
-BROWSER = next(filter(None, map(shutil.which, (
-    'chromium', 'chromium-browser', 'google-chrome', 'chromium-headless-shell'))), None)
-needs_browser = pytest.mark.skipif(BROWSER is None, reason='no Chromium is installed')
 
 
 class Explored:
@@ -69,26 +67,16 @@ def explored(loop):
 
 @pytest.fixture(scope='module')
 def browser():
-    playwright = pytest.importorskip('playwright.sync_api')
-    with playwright.sync_playwright() as chromium:
-        browser = chromium.chromium.launch(executable_path=BROWSER, args=['--no-sandbox'])
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 @contextmanager
 def opened(browser, url):
-    """Open the page; fail for what its script complains about."""
-    # Waiting for an expression evaluates text, which the page's policy forbids.
-    page, wrong = browser.new_page(
-        viewport={'width': 1280, 'height': 800}, bypass_csp=True), []
-    page.on('pageerror', lambda error: wrong.append(str(error)))
-    page.on('console', lambda line: line.type == 'error' and wrong.append(line.text))
-    page.goto(url)
-    page.wait_for_function('state && pictures.camera && pictures.goal')
-    yield page
-    page.close()
-    assert not wrong
+    """Open the page; wait for what it shows."""
+    with browsing.opened(browser, url) as page:
+        page.wait_for_function('state && pictures.camera && pictures.goal')
+        yield page
 
 
 def state(page):

@@ -215,7 +215,8 @@ class ExplorerCalls:
     def _propose(self) -> None:
         response = self._call('select', propose=True)
         self._display.select(response, followed=False)
-        self._display.events.add(f'{len(response.objects)} objects proposed')
+        self._display.events.add(
+            f'found {len(response.objects)}, which the goal shows elsewhere')
 
     def _move(self, name: str, u: float, v: float) -> None:
         display = self._display
@@ -261,6 +262,8 @@ class ExplorerCalls:
         self._display.events.add(f'{words}: begun')
         result = goal.result()
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
+        if result.end == 'succeeded' and not result.success:  # of its steps none is left
+            end += '; go again to come nearer'
         end = f'{words}: {end} ({result.steps} steps)'
         self.end = {'end': end, 'reached': result.success}
         self._display.events.add(end)
