@@ -33,7 +33,7 @@ CONTENTS = {
                      'docs/extending'),
     'Look up': ('docs/python', 'docs/site/api', 'docs/interface', 'bags/README', 'docs/speed'),
     'Understand': ('docs/architecture', 'docs/paper_map', 'docs/results/README', 'docs/results/*',
-                   'docs/reproduction', 'docs/peers'),
+                   'docs/peers'),
     'Project': ('CONTRIBUTING', 'SECURITY', 'QUALITY_DECLARATION', 'CHANGELOG'),
     'Weights': ('tap_ros/weights/*',)}
 

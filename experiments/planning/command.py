@@ -21,8 +21,8 @@ class Options:
     Options of the command.
 
     :param tasks: what is pushed or stacked.
-    :param methods: what is compared (docs/reproduction.md): direct, shipped, the names of
-        predictors of the command paper, or your own; with options behind colons: half,
+    :param methods: what is compared: direct, shipped, lowest_first, the names of predictors
+        of the command paper, or your own; with options behind colons: half,
         recursion<n>, rounds<n>, samples<n>, tracked, true_model, twice, steps<n>. By
         default the usual ones of each task, stacking only with weights that are there.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what

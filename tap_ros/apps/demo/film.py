@@ -173,7 +173,7 @@ def _frame(scene: Scene, t: int) -> np.ndarray:
         heading = run.heading_at(step)
         aim = _named(scene.headed(heading),
                      'goal picture' if heading == GOAL else 'predicted subgoal')
-        now = _named(scene.seen(mode, step), 'now; arrows: still to go')
+        now = _named(scene.seen(mode, step), 'now; arrows: where to')
         rows.append(np.concatenate([
             _line(*_title(scene, mode, step)), np.concatenate([aim, beside, now], 1)]))
     gap = np.full((GAP, WIDTH, 3), 255, np.uint8)
