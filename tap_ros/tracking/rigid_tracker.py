@@ -76,7 +76,8 @@ class RigidTracker:
         self._objects: list[_Object] = []
         self._gripper: np.ndarray | None = None
 
-    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray) -> Tracked:
+    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray,
+               drawn: Sequence[np.ndarray] = ()) -> Tracked:
         """Follow other objects; see Tracker."""
         plane = Plane(self._camera, view.image.shape[:2])
         picture = Picture(view, plane)
@@ -84,7 +85,8 @@ class RigidTracker:
         objects = []
         for k, click in enumerate(clicks):
             name = 'click ' + str(tuple(round(float(x), 1) for x in plane.enlarge(click)))
-            cut = clicked(picture, click, np.delete(clicks, k, 0), name)
+            line = plane.shrink(drawn[k]) if len(drawn) and len(drawn[k]) else None
+            cut = clicked(picture, click, np.delete(clicks, k, 0), name, line)
             shown, mask, face = picture.by(cut.metric), cut.mask, top_face(cut.mask, plane)
             sure = cut.whole and not cut.touched and cut.off(click) < OFF
             middle = plane.of_top(centre(face))

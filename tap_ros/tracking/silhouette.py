@@ -161,11 +161,13 @@ def shaded(colours: np.ndarray, share: float) -> np.ndarray:
     return np.asarray(cv2.LUT(lab, COLOUR.weighed))[:, 0]
 
 
-def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str) -> Cut:
+def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
+            line: np.ndarray | None = None) -> Cut:
     """
     Cut out the object under a click, see silhouette.
 
     :param name: of the click, for the message.
+    :param line: (N, 2) outline of the object, where it is known.
     :raises TrackingError: for a click outside the picture, on the robot, or on nothing.
     """
     h, w = picture.size
@@ -174,7 +176,12 @@ def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str) -> 
     if picture.hidden[round(float(at[1])), round(float(at[0]))]:
         raise TrackingError(f'{name} is on the robot or its shadow; click on an object, or move '
                             'the robot away first')
-    cut = silhouette(picture, at, others)
+    if line is not None:
+        mask = cv2.fillPoly(np.zeros(picture.size, np.uint8), [
+            np.rint(line).clip(-999, 999).astype(int)], 1) > 0
+        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, _share(mask, picture.hidden) <= TOUCHING)
+    else:
+        cut = silhouette(picture, at, others)
     if cut.mask.sum() < LEAST_AREA or cut.contrast < LEAST_CONTRAST:
         raise TrackingError(f'{name} is on nothing that differs from the table around it; click '
                             'on an object')
