@@ -124,7 +124,7 @@ def page(rows, pushed):
     films = rows[rows.recording.str.endswith('.mp4')]
     return render('templates/tracking.md.j2', columns=table(rows), films=film_table(films),
                   hard=hard(rows), clicks=clicks(rows), hard_episodes=HARD_EPISODES,
-                  places=int(films[films.metric == 'within_2px'].n.sum()),
+                  places=f'{int(films[films.metric == "within_2px"].n.sum()):,}',
                   confidence=confidence(rows.drop(films.index)), real=len(films) > 0,
                   loop=pushed, seed=SEED, off=OFF, episodes=EPISODES,
                   longest=round(rows[(rows.metric == 'longest_wrong_sure')

@@ -145,7 +145,7 @@ def test_a_neighbour_of_other_colours_is_left_out():
     view = draw(STARTS)
     view.image[85:115, 94:130] = 60, 60, 160  # it touches the first one
     found = load_plugin('tap_ros.trackers', 'rigid')(None).select(view, STARTS)
-    assert np.abs(found.pixels - STARTS).max() < 9
+    assert np.abs(found.pixels - STARTS).max() < 2
 
 
 def test_what_looks_otherwise_is_not_said_to_be_seen(tracker):
