@@ -19,7 +19,7 @@ SOURCES := package.xml setup.py setup.cfg tap_ros/base/contract.py resource/tap_
 # An environment that was copied or moved here from elsewhere names the old place everywhere.
 $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 
-.PHONY: help demo explore test test-all paper worlds faults build lint bench ros2 clean
+.PHONY: help demo explore test test-all docs paper worlds faults build lint bench ros2 clean
 
 help:
 	@echo 'make demo    push objects to a goal picture, directly and via the predicted subgoal'
@@ -28,6 +28,7 @@ help:
 	@echo '             and planned, push; ARGS="--task push3"'
 	@echo 'make test    the tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'
 	@echo 'make test-all also the tests that take minutes each'
+	@echo 'make docs    these pages as a site, in build/site, with search and an API reference'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; JOBS=4, ARGS=--list'
 	@echo 'make worlds  demonstrations of other simulators, and who finds their bottlenecks; goes on'
@@ -55,6 +56,11 @@ test: build
 test-all: build
 	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) $(ARGS)
 
+# Warnings are errors: a link that leads nowhere, a docstring that cannot be read.
+docs: build .venv/docs.done
+	@$(ENTER); python -m sphinx -W --keep-going -q -c docs/site . build/site
+	@echo 'build/site/index.html'
+
 paper: build
 	@$(ENTER); python -m experiments paper --jobs $(or $(JOBS),2) --results docs/results $(ARGS)
 
@@ -79,6 +85,11 @@ build: .venv/build.done
 
 .venv/build.done: .venv/wheels.done $(SOURCES)
 	@scripts/setup.bash build
+	@touch $@
+
+.venv/docs.done: requirements-docs.txt constraints.txt | .venv/wheels.done
+	@.venv/bin/python -m pip install -q --disable-pip-version-check --no-input -c constraints.txt \
+	  $(PIP_ARGS) -r requirements-docs.txt
 	@touch $@
 
 # In the environment of `make build`; apart from it, so that nothing else depends on it.

@@ -8,7 +8,7 @@ import sys
 from setuptools import find_packages, setup
 
 NAME = 'tap_ros'
-NODE_CLASSES = run_path('tap_ros/base/contract.py')['NODE_CLASSES']
+CONTRACT = run_path('tap_ros/base/contract.py')
 REQUIRED = [  # for pip
     'jinja2>=3.1',
     'lz4>=4.3',
@@ -30,7 +30,7 @@ REQUIRED = [  # for pip
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version=CONTRACT['VERSION'],
     description='Time-agnostic prediction of subgoal images, and visual MPC, for ROS 2',
     maintainer='The tap_ros authors',
     maintainer_email='tap_ros@users.noreply.github.com',
@@ -38,8 +38,9 @@ setup(
     python_requires='>=3.11',
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
     package_data={
-        NAME: ['*.pyi', 'apps/demo/*.html', 'apps/explorer/page/*', 'apps/mark_page/*', 'py.typed',
-               'ros/*.xml', 'weights/*.md', 'weights/*.png', 'weights/*.safetensors'],
+        NAME: ['*.pyi', 'apps/demo/*.html', 'apps/explorer/page/*', 'apps/mark_page/*',
+               'apps/shared_page/*', 'py.typed', 'ros/*.xml', 'weights/*.md', 'weights/*.png',
+               'weights/*.safetensors'],
         'sim_bridge': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -61,6 +62,6 @@ setup(
     },
     zip_safe=False,
     entry_points={
-        'console_scripts': [f'{name} = tap_ros.ros.run:main' for name in NODE_CLASSES],
+        'console_scripts': [f'{name} = tap_ros.ros.run:main' for name in CONTRACT['NODE_CLASSES']],
     },
 )

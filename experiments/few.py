@@ -56,7 +56,7 @@ class Options:
     :param demonstrations: points of the curve.
     :param seeds: trainings of each point.
     :param bags: folder of the bags; what is there is kept.
-    :param runs: folder of the trainings, likewise.
+    :param runs: folder of the trainings.
     :param out: folder for few.json, few.png and few.md.
     """
 

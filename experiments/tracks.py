@@ -36,6 +36,7 @@ SIDE = 64  # errors are in pixels of a picture so many pixels wide
 RIGHT, WRONG = 2.0, 3.0  # px: within is right; beyond is wrong
 SOON = 3  # pictures after an occlusion in which an object should be found
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 1.0)  # of confidence
+STIRS = 8.0  # px of a film, between two labels, up to which places in between are interpolated
 STRIPS, PANEL = 6, 256  # episodes that are drawn, px a side of a panel
 # Whose sheet a camera is fitted to: objects at one height to within this.
 LEVEL = 0.002  # m
@@ -61,19 +62,21 @@ class Track:
     shown: list[tuple[np.ndarray, Tracked]] = field(default_factory=list, repr=False)
 
 
-def score_bag(bag, size, click):
+def score_bag(bag, size, click, light=None):
     """
     Follow the objects of a bag; the camera is fitted to their true places.
 
     :param size: px of the longer side that pictures are scaled down to; 0: as they are.
     :param click: px of SIDE that clicks are off; 0: exact, and taken as they are.
+    :param light: factors of red, green and blue from the middle of an episode on, or None.
     :return: rows of summarise, and the tracks, some with pictures.
     """
     store = open_recordings(bag)
     make = partial(RigidTracker, fit_camera(store), snap=bool(click))
-    tracks = [follow(make, scaled(episode, size), click, keep=i < STRIPS)
+    tracks = [follow(make, relit(scaled(episode, size), light), click, keep=i < STRIPS)
               for i, episode in enumerate(store)]
-    about = {'tracker': 'rigid', 'click_px': click, 'size': size}
+    about = {'tracker': 'rigid', 'click_px': click, 'size': size,
+             'light': '' if light is None else str(list(light))}
     return [row | about for row in summarise(tracks, Path(bag).name)], tracks
 
 
@@ -171,6 +174,16 @@ def scaled(episode, size):
         goal_pixels=(episode.goal_pixels + half) * share - half)
 
 
+def relit(episode, light):
+    """Return an episode in another light from its middle on, see score_bag."""
+    if light is None:
+        return episode
+    frames = np.array(episode.frames)
+    later = frames[len(frames) // 2:]
+    later[:] = (later * np.float32(light)).clip(0, 255).astype(np.uint8)
+    return replace(episode, frames=frames)
+
+
 def is_covered(pixel, mask):
     """Return whether a robot mask (H, W) covers a pixel (u, v)."""
     if mask is None or not np.isfinite(pixel).all():
@@ -226,6 +239,8 @@ def summarise(tracks, name):
              for one, (_, states), good in zip(errors, objects, known)]
     add('wrong_sure', _over_objects(np.mean, wrong), count)
     add('longest_wrong_sure', [max(map(longest, wrong))] * 3, len(objects))
+    visible = [states[good] == LOST for (_, states), good in zip(objects, known)]
+    add('visible_lost', _over_objects(np.mean, visible), count)
     add('lost', share_interval([states[-1] == LOST for _, states in objects]), len(objects))
     again = [one for track in tracks for one in recoveries(track)]
     if again:
@@ -293,11 +308,19 @@ def fit_camera(episodes):
 def read_film(told, folder):
     """Read a film of the file of labels as an Episode."""
     wanted = range(told.get('first', 0), told['last'] + 1, told.get('step', 1))
-    frames = [frame for i, (_, frame) in enumerate(video_frames(Path(folder, told['film'])))
+    frames = [show() for i, (_, show) in enumerate(video_frames(Path(folder, told['film'])))
               if i in wanted]
     pixels = np.full((len(frames), len(told['objects']), 2), np.nan, np.float32)
-    for number, places in told['labels'].items():
-        pixels[wanted.index(int(number))] = [place or (np.nan, np.nan) for place in places]
+    labelled = sorted(map(int, told['labels']))
+    for number in labelled:
+        pixels[wanted.index(number)] = [
+            place or (np.nan, np.nan) for place in told['labels'][str(number)]]
+    for begin, end in zip(*[[wanted.index(number) for number in labelled][i:] for i in (0, 1)]):
+        first, last = pixels[begin], pixels[end]
+        rests = np.linalg.norm(last - first, axis=1) < STIRS
+        for t in range(begin + 1, end):
+            share = (t - begin) / (end - begin)
+            pixels[t, rests] = ((1 - share) * first + share * last)[rests]
     return make_episode(frames, np.arange(len(frames)) / 10, tuple(told['objects']),
                         object_pixels=pixels, object_source='by hand', task=told['film'])
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Digests of what must not change by accident: predictions, plans, a closed loop, bags, trainings.
+Digests of what must not change by accident: bags, trainings, predictions, plans, scores, loops.
 
     python scripts/golden.py            compare with test/golden.json; exit code 1 if any differs
     python scripts/golden.py --write    put this machine's digests there
@@ -31,9 +31,11 @@ from mcap.reader import make_reader  # noqa: E402
 import numpy as np  # noqa: E402
 from safetensors.numpy import load_file  # noqa: E402
 from sim_bridge.simulator import Simulator  # noqa: E402
+from tap_ros.planning.forward_model import LearnedForwardModel  # noqa: E402
 from tap_ros.planning.visual_mpc import Memory, Scene, VisualMPC  # noqa: E402
 from tap_ros.prediction.predictor import SubgoalPredictor  # noqa: E402
 from tap_ros.recording.cache import open_recordings  # noqa: E402
+from tap_ros.training.forward_scores import measure_maps, measure_pictures  # noqa: E402
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS  # noqa: E402
 import torch  # noqa: E402
 import tyro  # noqa: E402
@@ -131,6 +133,16 @@ def loops():
         simulator.close()
 
 
+def scores():
+    """Score the shipped forward model in the sample, by its maps and by its pictures."""
+    episodes = open_recordings([str(SAMPLE)], progress=False)
+    model, some = LearnedForwardModel.load(FORWARD_MODEL), np.arange(6)
+    for measure in (measure_maps, measure_pictures):
+        yield f'score {measure.__name__}', digest(*(
+            values for _, measured in sorted(measure(model, episodes, some).items())
+            for values in measured.values()))
+
+
 def collections(folder):
     """Collect episodes; a digest for each topic, so that a change can be told by its place."""
     for task, episodes in TASKS.items():
@@ -173,7 +185,7 @@ def make():
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory(prefix='golden-') as folder:
         os.environ['TAP_ROS_CACHE'] = str(Path(folder, 'cache'))
-        for part in (recordings(), predictions(), plans(), loops(),
+        for part in (recordings(), predictions(), plans(), loops(), scores(),
                      collections(Path(folder, 'bags')), trainings(Path(folder, 'runs'))):
             for name, value in part:
                 print(f'{value}  {name}', flush=True)

@@ -8,13 +8,14 @@ files do not depend on the number of workers. A finished file has its final name
 collection goes on with the files that are not there yet.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 import json
 from math import inf, nan
 from pathlib import Path
 import time
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from sim_bridge.tasks.tasks import get_task, TIMINGS
@@ -26,10 +27,10 @@ from tap_ros.base.errors import check_fields, ConfigError, RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
 from tap_ros.base.options import Folder, one_of
 from tap_ros.base.plugins import names
+from tap_ros.base.progress import Progress
 from tap_ros.base.text import escaped
 from tap_ros.recording.writer import count_episodes, EpisodeWriter, write_metadata
 from tap_ros.robots.arm import DEFAULT_ARM
-from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
@@ -57,10 +58,11 @@ class CollectConfig:
         late, drawn for each episode.
     :param misses: share of the pushes that are at random, so that objects are hit, grazed and
         missed: what a forward model has to tell apart.
-    :param look: of the world, see looks.LOOKS.
-    :param appearance: of table, light and camera, see looks.CHOICES; 'random' is drawn anew for
-        every episode.
-    :param arm: name of an arm, see robots.arm.get_arm.
+    :param pushes: in another world, to record what the planner sees there, with robot masks and
+        objects: pushes of its object to the 'goal', or at 'random' for a forward model.
+    :param look: of the world: the whole arm at its table, or its hand alone.
+    :param appearance: of table, light and camera; 'random' is drawn anew for every episode.
+    :param arm: at the table.
     """
 
     world: Annotated[str, one_of(names('tap_ros.worlds'))] = TABLE
@@ -72,6 +74,7 @@ class CollectConfig:
     frames: int = 0
     timing: Annotated[str, one_of(TIMINGS)] = 'natural'
     misses: float = 0.0
+    pushes: Literal['', 'goal', 'random'] = ''
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     appearance: Annotated[str, one_of(CHOICES)] = 'usual'
     arm: Annotated[str, one_of(names('tap_ros.arms'))] = DEFAULT_ARM
@@ -100,6 +103,9 @@ def run(args: Options) -> None:
           f"{result['seconds']['wall']:.0f} s; objects end "
           f"{100 * result['mean_final_distance']:.1f} cm from their goals on average, "
           f"{result['success_rate']:.0%} of the episodes succeed")
+    if known := result['bottlenecks']:
+        print(f'{BOTTLENECKS_FILE}: ' + ', '.join(
+            f'{why or "known"} in {count}' for why, count in known.most_common()))
 
 
 def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
@@ -114,8 +120,8 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
     :param make: makes a world with `demonstrate` of a task and an image size, in the place of that
         which is named; the name only tells its recordings from others.
     :return: dict of episodes, frames, seconds (wall, and of acting and writing, summed over
-        workers), success rate, mean final distance in metres, of the episodes collected by this
-        call.
+        workers), success rate, mean final distance in metres, bottlenecks (Counter of why they
+        are not known, '' of those that are), of the episodes collected by this call.
     :raises ConfigError: when the folder holds a recording made with other settings.
     :raises EngineError: when worker processes are killed again and again.
     :raises StorageError: when the disk is full, or another process is collecting there. Files
@@ -133,7 +139,7 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
         total = sum(len(_episodes(config, i)) for i in missing)
         tasks = [Work(_shard_path(folder, i).name, _collect_shard, (str(folder), config, i, make))
                  for i in missing]
-        with tqdm(total=total, unit='episode', disable=not progress) as bar:
+        with Progress(total=total, unit='episode', disable=not progress) as bar:
             for _, get in run_tasks(tasks, engine):
                 found = get()
                 _note_bottlenecks(folder, [row['mark'] for row in found if row['mark']])
@@ -146,7 +152,8 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
     return {
         'episodes': len(rows), 'frames': sum(row['frames'] for row in rows), 'seconds': seconds,
         'success_rate': float(np.mean([row['success'] for row in rows] or nan)),
-        'mean_final_distance': float(np.mean(distances or nan))}
+        'mean_final_distance': float(np.mean(distances or nan)),
+        'bottlenecks': Counter(row['unknown'] for row in rows if row['mark'] or row['unknown'])}
 
 
 def _check(config: CollectConfig, make: Make | None) -> None:
@@ -162,6 +169,11 @@ def _check(config: CollectConfig, make: Make | None) -> None:
         world = _make(config, make)
         ability(world, 'demonstrate')
         world.close()
+        if config.pushes and not getattr(world, 'slides', False):
+            raise ConfigError(f'pushes: nothing can be pushed about in {config.task} of '
+                              f'{config.world}; leave it out')
+    elif config.pushes:
+        raise ConfigError(f'pushes: of other worlds; in {TABLE} see misses')
     elif get_task(config.task).kind != 'push' and (config.misses or config.timing != 'natural'):
         raise ConfigError(f'misses and timing are of tasks of pushing, not of {config.task}')
 
@@ -223,7 +235,9 @@ def _collect_shard(folder: str, config: CollectConfig, shard: int,
                    make: Make | None) -> list[dict[str, Any]]:
     """Collect one file; runs in a worker process. Return what is told of each of its episodes."""
     world, rows = _make(config, make), []
-    how = {'timing': config.timing, 'misses': config.misses} if config.world == TABLE else {}
+    how: dict[str, Any] = {'pushes': config.pushes} if config.pushes else {}
+    if config.world == TABLE:
+        how = {'timing': config.timing, 'misses': config.misses}
     with EpisodeWriter(_shard_path(folder, shard), camera_matrix=world.camera_matrix) as writer:
         for i in _episodes(config, shard):
             times = [time.perf_counter()]
@@ -236,7 +250,8 @@ def _collect_shard(folder: str, config: CollectConfig, shard: int,
                 'recording': '.', 'episode': i,
                 'stamps': [[float(stamps[t]) / 1e9 for t in found.bottleneck]]}
             rows.append({
-                'frames': len(stamps), 'success': found.episode.outcome == 'success', 'mark': mark,
+                'frames': len(stamps), 'success': found.episode.outcome == 'success',
+                'mark': mark, 'unknown': found.unknown,
                 'distances': world.distances().tolist(), 'act': times[1] - times[0],
                 'write': times[2] - times[1]})
     world.close()

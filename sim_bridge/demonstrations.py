@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from sim_bridge.world.gap import FAR
 from sim_bridge.world.protocol import Observation
 from tap_ros.recording.episode import Episode
 
@@ -25,6 +26,8 @@ PAUSES, PAUSE_FRAMES, PAUSE_RANGE = (1, 3), (1, 4), (1, 40)  # count, length, be
 BEFORE, AFTER = (0, 3), (1, 4)  # frames at rest before it begins, and after its success
 NEAR = 0.03  # m, between the hand and where it is when things begin to move
 BEGUN, GONE = 0.02, 0.15  # shares of their way that things have moved
+TOUCH = 0.01  # m, of the gap between the robot and things: it is at them
+MOST = 0.5  # of the longest way: what is struck in passing goes less far
 
 
 class Stage(Protocol):
@@ -59,6 +62,9 @@ class Stage(Protocol):
     def movable(self) -> np.ndarray:
         """Return where all that can be moved is, (Q,) m and rad."""
 
+    def gap(self) -> float:
+        """Return how far the robot is from what can be moved, in m, FAR at most."""
+
     def picture(self) -> np.ndarray:
         """Return what the camera sees, (H, W, 3) uint8."""
 
@@ -73,10 +79,12 @@ class Demonstration:
 
     :param episode: of a script, whose actions are what was commanded, without objects and gripper.
     :param bottleneck: its first and last frame, by the simulator; None: not known.
+    :param unknown: why it is not; '' where nobody looked.
     """
 
     episode: Episode
     bottleneck: tuple[int, int] | None = None
+    unknown: str = ''
 
 
 def demonstrate(stage: Stage, seed: int, num_frames: int = 0) -> Demonstration:
@@ -94,13 +102,13 @@ def demonstrate(stage: Stage, seed: int, num_frames: int = 0) -> Demonstration:
         if done and len(rows) >= LEAST_FRAMES:
             break
     frames, *others = zip(*rows)
-    commands, hands, places = map(np.stack, others)
+    commands, hands, places, gaps = map(np.stack, others)
     commands[-1] = 0
     episode = make_episode(
         frames, np.arange(len(rows)) * stage.steps * stage.step_ns / 1e9,
         actions=commands.astype(np.float32), object_source='', task=stage.task_name, seed=seed,
         outcome='success' if done else 'failure')
-    return Demonstration(episode, find_bottleneck(hands, places))
+    return Demonstration(episode, *find_bottleneck(hands, places, gaps))
 
 
 def to_episode(seen: Sequence[Observation], actions: np.ndarray, goal: Observation, task: str,
@@ -123,30 +131,45 @@ def to_episode(seen: Sequence[Observation], actions: np.ndarray, goal: Observati
         robot_masks=np.stack([one.robot_mask for one in seen]), goal_mask=goal.robot_mask)
 
 
-def find_bottleneck(hands: np.ndarray, places: np.ndarray) -> tuple[int, int] | None:
+def find_bottleneck(hands: np.ndarray, places: np.ndarray,
+                    gaps: np.ndarray) -> tuple[tuple[int, int] | None, str]:
     """
     Find the frames in which the hand is at what it is about to move.
 
-    They begin where the hand has come, for good, NEAR to where it is when things begin to move,
-    and end when things have gone the share GONE of their way.
+    They are of the last time that the robot comes to things, from FAR to TOUCH, and moves them
+    most of their way: what settles by itself, or is struck in passing, does not count. They begin
+    where the hand has come, for good, NEAR to where it is when things begin to move, and end when
+    things have gone the share GONE of their way.
 
     :param hands: (T, 3) m.
     :param places: (T, Q) m and rad, of all that can be moved.
-    :return: first and last of these frames; None if nothing moves, or from the start on.
+    :param gaps: (T,) m, between the robot and what can be moved.
+    :return: first and last of these frames, or None; and why it is not known.
     """
-    way = np.linalg.norm(places - places[1], axis=1)  # things settle in the first frame
-    way[0] = 0
-    if way.max() <= 1e-6:
-        return None
-    begun, gone = (int((way > share * way.max()).argmax()) for share in (BEGUN, GONE))
-    away = np.flatnonzero(np.linalg.norm(hands[:begun] - hands[begun], axis=1) >= NEAR)
-    first, last = (int(away[-1]) + 1 if len(away) else 0), min(gone, len(hands) - 2)
-    return (first, last) if 0 < first <= last else None
+    # Things settle in the first frame.
+    most = max(np.linalg.norm(places[k:] - places[k - 1], axis=1).max()
+               for k in range(2, len(places)))
+    if most <= 1e-6:
+        return None, 'nothing moves'
+    if not (gaps < TOUCH).any():
+        return None, 'the robot touches nothing that moves'
+    first, last, is_far = 0, 0, gaps[0] >= FAR
+    for k in range(1, len(gaps)):
+        way = np.linalg.norm(places - places[k - 1], axis=1)
+        way[:k] = 0
+        if is_far and gaps[k] < TOUCH and way.max() >= MOST * most:
+            begun, gone = (int((way > share * way.max()).argmax()) for share in (BEGUN, GONE))
+            away = np.flatnonzero(np.linalg.norm(hands[:begun] - hands[begun], axis=1) >= NEAR)
+            first, last = (int(away[-1]) + 1 if len(away) else 0), min(gone, len(gaps) - 2)
+        is_far = gaps[k] >= FAR or (is_far and gaps[k] >= TOUCH)
+    if not first:
+        return None, 'the hand is there from the start'
+    return ((first, last), '') if first <= last else (None, 'the hand comes with the last frame')
 
 
 def _act_unsteadily(stage: Stage, rng: np.random.Generator,
                     num_frames: int) -> tuple[list[tuple[np.ndarray, ...]], bool]:
-    """Return frame, command, hand and places at each time of one try; whether it succeeded."""
+    """Return picture, command, hand, places and gap of each frame; whether it succeeded."""
     steps = stage.steps
 
     def some(frames: tuple[int, int]) -> int:
@@ -166,7 +189,8 @@ def _act_unsteadily(stage: Stage, rng: np.random.Generator,
         if step % steps == 0:
             commanded = np.zeros(4)  # dx, dy, dz in m till the next picture, opening
             rows.append((
-                stage.picture(), commanded, stage.hand().copy(), stage.movable().copy()))
+                stage.picture(), commanded, stage.hand().copy(), stage.movable().copy(),
+                np.array(stage.gap())))
         resting = pauses.get(step, resting)
         if resting:
             resting -= 1

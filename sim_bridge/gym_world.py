@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from sim_bridge.demonstrations import Demonstration
+from sim_bridge.pushes import demonstrate_pushes
 from sim_bridge.world.camera import OneCamera
 from sim_bridge.world.protocol import clip_action, Observation
 from tap_ros.base.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
@@ -27,11 +29,15 @@ class GymWorld(OneCamera, ABC):
     :ivar task_name: what the environment is about.
     :ivar object_names: of its K objects.
     :ivar camera: that takes its pictures.
+    :ivar slides: whether its first object can be pushed about.
+    :ivar ways: places (x, y), m, by which that has to be pushed to its goal, for who demonstrates.
     """
 
     task_name: str
     object_names: tuple[str, ...]
     arm = None  # its joints are not told
+    slides = True
+    ways: tuple[tuple[float, float], ...] = ()
     seed: int | None = None  # of the scene
     _goal: Observation | None = None
 
@@ -121,6 +127,10 @@ class GymWorld(OneCamera, ABC):
         self._check(hide_arm)
         assert self._goal is not None
         return replace(self._goal, stamp_ns=0)
+
+    def demonstrate(self, seed: int, num_frames: int = 0, pushes: str = 'goal') -> Demonstration:
+        """Push the first object, to the 'goal' or at 'random', as pushes.py says."""
+        return demonstrate_pushes(self, pushes, seed)
 
     def distances(self) -> np.ndarray:
         """Return (K,) metres from each object to its goal."""

@@ -16,6 +16,7 @@ import numpy as np
 from sim_bridge.demonstrations import demonstrate, Demonstration
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera, Renderer
+from sim_bridge.world.gap import Gap
 from tap_ros.base.contract import (
     CONTROL_PERIOD,
     ROBOT_MASK_ARM,
@@ -25,16 +26,18 @@ from tap_ros.base.contract import (
 from tap_ros.base.errors import ConfigError, SceneError
 from tap_ros.base.text import meant
 
-ORIGIN = np.array([0.0, 0.65, 0.01])  # m, of our frame in Meta-World's
+ORIGIN = np.array([0.0, 0.65, 0.0])  # m, of our frame in Meta-World's; on the table
 TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about the vertical
-CAMERA = Camera(64, 64, tilt=0.54, fovy=24.0, position=(0.0, -0.78, 1.2))  # in our frame
+CAMERA = Camera(64, 64, tilt=0.54, fovy=24.0, position=(0.0, -0.78, 1.21))  # in our frame
 # From the robot's side: what it works at hides little.
-SIDE = replace(CAMERA, tilt=0.87, fovy=42.0, position=(0.85, 0.5, 0.85), turn=2.1)
+SIDE = replace(CAMERA, tilt=0.87, fovy=42.0, position=(0.85, 0.5, 0.86), turn=2.1)
 GAIN = 12.0  # of the command over the gap to where the fingertips shall be, 1/m
 LEAD = 0.06  # m, by which what pulls the hand may be ahead of one that is blocked
 SOLVING_STEPS = 400  # environment steps that the scripted policy has at most
 FURTHER_STEPS = 60  # of it after the success, whose bounds are wide
 LEAVING = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.12), (0.0, 0.1, 0.0))  # m, of the open hand, then
+# Places of our frame, m, by which the object has to go, as a wall stands in the way.
+WAYS: dict[str, tuple[tuple[float, float], ...]] = {'push-wall-v3': ((0.12, 0.0), (0.12, -0.2))}
 REACH = np.array([[-0.35, 0.45, 0.12], [0.35, 0.8, 0.4]])  # m, in their frame
 
 
@@ -52,7 +55,7 @@ class MetaWorld(GymWorld):
     steps, reach = 4, REACH  # of demonstrations
 
     def __init__(self, task: str = 'push-v3', image_size: int = 64) -> None:
-        self.task_name = task
+        self.task_name, self.ways = task, WAYS.get(task, ())
         self.env, self.policy = make_env(task)
         self.camera = replace(CAMERA, width=image_size, height=image_size)
         model = self.env.model
@@ -64,7 +67,8 @@ class MetaWorld(GymWorld):
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # the goal is drawn as a site
         self._labels = _labels(model)
-        self._movable = _movable(model)
+        self._movable, self._gap = _movable(model), Gap(model, 'base')
+        self.slides = _slides(model)
         self.step_ns, self.scale = round(1e9 * self.env.dt), self.env.action_scale * TURN
         self._seen: np.ndarray = np.empty(0)
         self._begun = 0  # the seed of the scene
@@ -142,9 +146,10 @@ class MetaWorld(GymWorld):
         raise SceneError(f'task {self.task_name}: the scripted policy does not solve this scene; '
                          'take another seed')
 
-    def demonstrate(self, seed: int, num_frames: int = 0) -> Demonstration:
-        """Let the scripted policy act as demonstrations.demonstrate says."""
-        return demonstrate(self, seed, num_frames)
+    def demonstrate(self, seed: int, num_frames: int = 0, pushes: str = '') -> Demonstration:
+        """Push as pushes.py says; without a word for it let the scripted policy act."""
+        return super().demonstrate(seed, pushes=pushes) if pushes else demonstrate(
+            self, seed, num_frames)
 
     def command(self) -> np.ndarray:
         """Return what the scripted policy commands now, (4,) in [-1, 1]."""
@@ -159,6 +164,10 @@ class MetaWorld(GymWorld):
     def movable(self) -> np.ndarray:
         """Return where all is that is not the robot, without orientations."""
         return np.array(self.env.data.qpos[self._movable])
+
+    def gap(self) -> float:
+        """Return how far the robot is from what is not the robot and moves, m."""
+        return self._gap(self.env.data)
 
     def picture(self) -> np.ndarray:
         """Return what a camera beside the robot sees."""
@@ -221,6 +230,13 @@ def _labels(model: mujoco.MjModel) -> np.ndarray:
         if labels[model.body_parentid[body]] == ROBOT_MASK_HAND:
             labels[body] = ROBOT_MASK_HAND
     return labels[model.geom_bodyid]
+
+
+def _slides(model: mujoco.MjModel) -> bool:
+    """Return whether something that is not the robot can be pushed about on the table."""
+    kinds = model.jnt_type[model.body_rootid[model.jnt_bodyid] != model.body('base').rootid]
+    return bool((kinds == mujoco.mjtJoint.mjJNT_FREE).any()
+                or (kinds == mujoco.mjtJoint.mjJNT_SLIDE).sum() > 1)
 
 
 def _movable(model: mujoco.MjModel) -> np.ndarray:

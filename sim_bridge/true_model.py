@@ -55,10 +55,12 @@ class TrueModel:
     def carried_maps(self, start: Start, gripper: torch.Tensor | None, maps: torch.Tensor,
                      actions: torch.Tensor, /, every: int = 1) -> Iterator[torch.Tensor]:
         """
-        Yield the maps (N, K, n, n) after every so many steps, see protocols.ForwardModel.
+        Yield the maps (N, K, n, n) after every so many steps.
 
-        :param start: from begin; actions (N, horizon, 4).
+        :param start: from begin.
         :param gripper: is not looked at, all sequences begin where the simulator's gripper is.
+        :param maps: (K, n, n); only their shape counts.
+        :param actions: (N, T, 4): dx, dy, dz in metres, and opening; T a multiple of `every`.
         """
         model, state, target = start
         actions, same = torch.unique(actions, dim=0, return_inverse=True)

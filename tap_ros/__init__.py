@@ -11,8 +11,10 @@ import os
 import signal
 import sys
 
-from tap_ros.base.contract import NODE_CLASSES
+from tap_ros.base.contract import NODE_CLASSES, VERSION
 from tap_ros.base.interrupts import leave_at_once
+
+__version__ = VERSION
 
 # There an interrupt would come out as any error of what is imported. Commands and nodes handle it
 # themselves as soon as they run.
@@ -45,21 +47,42 @@ if not os.access(_home, os.W_OK):
     if _home == '~':  # other libraries look for one, too
         os.environ['HOME'] = _folder
 
-# What most users need; each is imported when it is asked for, so that nodes stay light.
+# What users need, also for parts of their own; each is imported when it is asked for, so that
+# nodes stay light.
 _EXPORTS = {
     'Arm': 'tap_ros.robots.arm',
+    'Camera': 'sim_bridge.world.camera',
+    'carry_out': 'sim_bridge.tasks.motions',
     'Client': 'tap_ros.ros.client',
     'EpisodeWriter': 'tap_ros.recording.writer',
     'ForwardModel': 'tap_ros.planning.protocols',
+    'get_arm': 'tap_ros.robots.arm',
+    'GymWorld': 'sim_bridge.gym_world',
     'iter_episodes': 'tap_ros.recording.reader',
+    'load_plugin': 'tap_ros.base.plugins',
+    'load_predictor': 'tap_ros.prediction.protocol',
+    'Mount': 'tap_ros.robots.arm',
+    'Observation': 'sim_bridge.world.protocol',
     'open_recordings': 'tap_ros.recording.cache',
     'Predictor': 'tap_ros.prediction.protocol',
+    'Problem': 'tap_ros.planning.protocols',
+    'random_shape': 'sim_bridge.world.scene',
+    'Scene': 'tap_ros.planning.visual_mpc',
+    'SearchConfig': 'tap_ros.planning.protocols',
     'Simulator': 'sim_bridge.simulator',
+    'Solution': 'tap_ros.planning.protocols',
     'Solver': 'tap_ros.planning.protocols',
+    'Subgoal': 'tap_ros.messages.subgoals',
     'SubgoalPredictor': 'tap_ros.prediction.predictor',
     'TapError': 'tap_ros.base.errors',
+    'Task': 'sim_bridge.tasks.tasks',
+    'TaskScene': 'sim_bridge.tasks.tasks',
+    'Tracked': 'tap_ros.tracking.protocols',
+    'Tracker': 'tap_ros.tracking.protocols',
     'train': 'tap_ros.apps.train',
+    'trained_crop': 'tap_ros.images.crop',
     'VisualMPC': 'tap_ros.planning.visual_mpc',
+    'VisualMPCConfig': 'tap_ros.planning.mpc_config',
     'World': 'sim_bridge.world.protocol',
 }
 __all__ = list(_EXPORTS)

@@ -101,7 +101,8 @@ def _inspect() -> Command:
     return Command(Options, run)
 
 
-LINE = CommandLine('python -m tap_ros', 'Collect recordings, train, evaluate, show.', {
+LINE = CommandLine('python -m tap_ros', (
+    'Collect recordings, train, evaluate, show. --version prints the version.'), {
     'collect': ('simulate the expert and record it', _collect),
     'import-video': ('import video files', _import_video),
     'import-arrays': ('import pictures of HDF5 files', _import_arrays),

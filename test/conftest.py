@@ -3,7 +3,8 @@
 """
 What all tests share.
 
-Modules beside this file (domains, made_episodes, processes) can be imported by every test.
+Modules beside this file (browsing, domains, made_episodes, processes) can be imported by every
+test.
 """
 
 import os

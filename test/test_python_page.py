@@ -1,19 +1,21 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The examples of docs/python.md, one for each name that tap_ros exports."""
+"""The examples of docs/python.md; with those of docs/extending.md one for each name of tap_ros."""
 
 from pathlib import Path
 import re
 
 import tap_ros
 
-PAGE = (Path(__file__).parents[1] / 'docs' / 'python.md').read_text()
+DOCS = Path(__file__).parents[1] / 'docs'
+PAGE = (DOCS / 'python.md').read_text()
+SHOWN = PAGE + (DOCS / 'extending.md').read_text()
 BLOCKS = re.findall(r'^```python\n(.*?)^```$', PAGE, re.M | re.S)
 
 
 def test_the_examples_run_and_have_every_name(tmp_path, monkeypatch, capsys):
     for name in set(tap_ros.__all__) - {'iter_episodes'}:  # open_recordings does for all
-        assert re.search(rf'^from tap_ros import .*\b{name}\b', PAGE, re.M), name
+        assert re.search(rf'^from tap_ros import .*\b{name}\b', SHOWN, re.M), name
     (tmp_path / 'bags').symlink_to(Path(__file__).parents[1] / 'bags')
     monkeypatch.chdir(tmp_path)
     names = {}

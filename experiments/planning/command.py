@@ -21,13 +21,13 @@ class Options:
     Options of the command.
 
     :param tasks: what is pushed or stacked.
-    :param methods: what is compared, see experiments/planning/methods.py: direct, shipped, the
-        names of predictors of the command paper, or your own; with options behind colons: half,
+    :param methods: what is compared: direct, shipped, lowest_first, the names of predictors
+        of the command paper, or your own; with options behind colons: half,
         recursion<n>, rounds<n>, samples<n>, tracked, true_model, twice, steps<n>. By
         default the usual ones of each task, stacking only with weights that are there.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
-    :param look: of the world, see sim_bridge.world.looks; pictures are filled behind the robot as
+    :param look: of the world; pictures are filled behind the robot as
         the weights' training was, by the looks' robot masks.
     :param scenes: how many.
     :param seed: of the first scene; 0: the usual one, in which nothing was trained.

@@ -23,6 +23,7 @@ from tap_ros.base.engines import LOCAL, run_tasks, Work
 from tap_ros.base.errors import ConfigError, ImageError, PlanningError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.plugins import load_plugin
+from tap_ros.base.progress import Progress
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
@@ -30,7 +31,6 @@ from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import FORWARD_MODEL
 from tap_ros.weights.weights import stored_digest
 import torch
-from tqdm import tqdm
 
 SPEED_ONLY = ('batch_size', 'threads')  # settings of the planner that change no result
 DIGITS = 16  # of the SHA-256 of what a weights file holds
@@ -161,7 +161,7 @@ def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True):
             if seed not in file.scenes]
     tasks = {Work(f'{jobs[i].task}, {jobs[i].method.name}, scene {seed}', run_scene,
                   (jobs[i], seed)): i for i, seed in todo}
-    with tqdm(total=len(todo), desc='scenes x methods', disable=not progress) as bar:
+    with Progress(total=len(todo), desc='scenes x methods', disable=not progress) as bar:
         for task, get in run_tasks(tasks, engine):
             i, scene = tasks[task], get()
             files[i].add(scene)

@@ -7,51 +7,54 @@ Bags of pushes in Meta-World, a forward model and predictors from them, and the 
 planning/reach.py, in fresh scenes. What counts is the environment's own signal.
 """
 
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from dataclasses import dataclass
 import json
+import os
 from pathlib import Path
 
 import cv2
 from experiments.pages import render, share
-from experiments.planning.episode import run_episode
-from experiments.planning.methods import FIRST_SCENE, Method
-from experiments.worlds.pushes import push_to_goal, WORLDS
+from experiments.planning.methods import FIRST_SCENE
+from experiments.worlds.judged import (
+    BUDGETS,
+    draw_strip,
+    DRAWN,
+    film,
+    IMAGE_SIZE,
+    PLANNED,
+    run_scene,
+    UNTRAINED,
+    Weights,
+    WITH_WAYS,
+)
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
-from sim_bridge.metaworld import MetaWorld
+from sim_bridge.metaworld import WAYS
 from tap_ros.apps.train import train
-from tap_ros.base.contract import ACTION_LIMIT, step_budget
 from tap_ros.base.engines import Engine
-from tap_ros.base.errors import SceneError
+from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically, write_rows
 from tap_ros.base.options import Flag, Folder
 from tap_ros.evaluation.intervals import mean_interval, share_interval
-from tap_ros.images.drawing import enlarge, grid
-from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.protocols import SearchConfig
-from tap_ros.planning.visual_mpc import VisualMPC
-from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.images.drawing import grid
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
 from tqdm import tqdm
 
-WORLD, IMAGE_SIZE = 'metaworld', 64
+WORLD = 'metaworld'
 BAGS = {'random': 100_000, 'goal': 0}  # of pushes; the first seed
-METHODS = ('random', 'straight', 'direct', 'subgoal')
+METHODS = (*UNTRAINED, *PLANNED)
+LEARNED = ('fixed time', 'subgoal')  # methods that are trained anew by each seed
 MARKED, MOVED = 12, 1.0  # demonstrations; px, beyond which an object has begun to move
+AT, RESTS, JOLT = 0.06, 0.005, 0.025  # m: by the way; in a period of rest; as the hand leaves
+# At the usual learning rate it came to believe that nothing ever moves.
 FORWARD = {'robot_mask': 'arm', 'initial_weights': 'push', 'batch_size': 8, 'grow': 0.3,
-           'device': 'cpu', 'threads': 1, 'save_every': 200, 'split': 'crc32'}
-PREDICTOR = {'selection': 'marks', 'progress_margin': 0.0, 'start_crop': 0.0,
-             'initial_weights': 'push2', 'goal_picture': 'recorded', 'robot_mask': 'arm',
-             'fill_context': 1.0, 'batch_size': 8, 'device': 'cpu', 'threads': 1}
-# Half of what is usual, so that a plan takes half the time.
-PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threads=1)
-REACHED = 2.0  # px, here about cm: within this, the object is at its goal
-STRIPS = 3  # scenes of each task that are drawn
-SCALE = 2  # of pictures that are drawn
-_planner, _predictor = lru_cache(VisualMPC.load), lru_cache(SubgoalPredictor.load)
+           'learning_rate': 5e-4, 'device': 'cpu', 'threads': 1, 'save_every': 100,
+           'split': 'crc32'}
+PREDICTOR = {'progress_margin': 0.0, 'start_crop': 0.0, 'initial_weights': 'push2',
+             'goal_picture': 'recorded', 'robot_mask': 'arm', 'fill_context': 1.0,
+             'batch_size': 8, 'device': 'cpu', 'threads': 1, 'save_every': 100}
 
 
 @dataclass(frozen=True)
@@ -60,23 +63,25 @@ class Options:
     Options of the command.
 
     :param tasks: of Meta-World, in which an object slides on the table in view of the camera.
-    :param episodes: of each bag: pushes at random, and demonstrations.
-    :param steps: of the training of the forward model, on the bags of all tasks.
-    :param predictor_steps: of the training of each task's predictor.
+    :param episodes: of each bag: demonstrations, and pushes at random.
+    :param steps: of the training of each task's forward model.
+    :param predictor_steps: of the training of each task's predictors.
     :param methods: that act in each scene.
+    :param seeds: trainings of each predictor.
     :param scenes: of each task; those are left out whose goal the script of the environment's
         authors does not bring about.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
-    :param runs: folder of the trainings and of the scenes that were run, likewise.
+    :param runs: folder of the trainings and of the scenes that were run.
     :param out: folder for worlds_loop.json, worlds_loop.md and worlds_loop.png.
     :param results_only: run no more scenes.
     """
 
-    tasks: tuple[str, ...] = ('push-v3', 'plate-slide-v3')
-    episodes: int = 60
-    steps: int = 800
+    tasks: tuple[str, ...] = ('push-wall-v3', 'push-v3', 'plate-slide-v3')
+    episodes: int = 120
+    steps: int = 1000
     predictor_steps: int = 400
     methods: tuple[str, ...] = METHODS
+    seeds: int = 1
     scenes: int = 50
     bags: Folder = 'bags/loop'
     runs: Folder = 'runs/loop'
@@ -86,61 +91,118 @@ class Options:
 
 
 def run(args):
-    """Collect, train, run scene by scene all methods, write what came of it."""
-    if not args.results_only:
-        run_scenes(args, make_weights(args))
+    """Run what needs no training, collect, train, run the rest; the page is written all along."""
+    unknown = set(args.methods) - set(METHODS)
+    if unknown:
+        raise ConfigError(f'methods: {", ".join(sorted(unknown))} unknown; valid: '
+                          + ', '.join(METHODS))
+    for task in () if args.results_only else args.tasks:
+        Path(args.runs, task).mkdir(parents=True, exist_ok=True)
+        run_scenes(args, task, {method: Weights() for method in UNTRAINED})
+        for seed in range(args.seeds):
+            run_scenes(args, task, make_weights(args, task, seed), seed)
     write_results(Path(args.runs), Path(args.out), args)
+    draw(args)
+    print(Path(args.out, 'worlds_loop.md'))
 
 
-def make_weights(args):
-    """Make bags and trainings; return paths by task, and the forward model's."""
-    bags = {task: Path(args.bags, task) for task in args.tasks}
-    for task, folder in bags.items():
-        for pushes, seed in BAGS.items():
-            collect(folder / pushes, CollectConfig(
-                world=f'{WORLD} {pushes}', task=task, episodes=args.episodes, seed=seed,
-                image_size=IMAGE_SIZE, episodes_per_file=10), args.engine, make=WORLDS[pushes])
-    weights = {'forward': str(train(
-        [folder / name for folder in bags.values() for name in BAGS],
-        Path(args.runs, 'forward'), 'forward', steps=args.steps, **FORWARD))}
-    for task, folder in bags.items():
-        weights[task] = '' if 'subgoal' not in args.methods else str(train(
-            folder / 'goal', Path(args.runs, task), steps=args.predictor_steps,
-            marks=mark(folder / 'goal'), **PREDICTOR))
+def draw(args):
+    """Draw scenes of which actions are kept; film the first that succeeds via subgoals alone."""
+    strips, films = [], []
+    for task in args.tasks:
+        for seed, rows in read_rows(args.runs, task)[1].items():
+            if strip := draw_strip(task, seed, Path(args.runs, task)):
+                strips.append(strip)
+                direct, subgoal = (rows[method]['ends'] for method in DRAWN)
+                if subgoal and not direct and not films:
+                    films.append(film(task, seed, Path(args.runs, task)))
+    if strips:
+        cv2.imwrite(str(Path(args.out, 'worlds_loop.png')), grid(strips)[..., ::-1])
+    for shown in films:
+        write_atomically(Path(args.out, 'worlds_loop.webp'), shown)
+
+
+def make_weights(args, task, seed):
+    """Make bags and trainings of a task; return Weights by method."""
+    bag, runs, ways = Path(args.bags, task), Path(args.runs, task), WAYS.get(task, ())
+    planned = [method for method in args.methods if method in PLANNED]
+    if not planned:
+        return {}
+    for pushes, first in BAGS.items():
+        collect(bag / pushes, CollectConfig(
+            world=WORLD, task=task, pushes=pushes, episodes=args.episodes, seed=first,
+            image_size=IMAGE_SIZE, episodes_per_file=10), args.engine)
+    forward = str(train([bag / pushes for pushes in BAGS], runs / 'forward', 'forward',
+                        steps=args.steps, **FORWARD))
+    marks = str(mark(bag / 'goal', ways))
+    weights = {method: Weights(forward, '', f'{bag / "goal"}{os.pathsep}{marks}')
+               for method in planned if seed == 0 or method in LEARNED}
+    for method, settings in (
+            ('fixed time', {'loss': 'fix', 'min_crop': 0.3 if ways else 1.0}),
+            ('subgoal', {'selection': 'marks', 'marks': marks, 'recursion': max(1, len(ways))})):
+        if method in weights:
+            weights[method] = weights[method]._replace(predictor=str(train(
+                bag / 'goal', runs / f'{method.replace(" ", "_")}_{seed}',
+                steps=args.predictor_steps, seed=seed, **PREDICTOR, **settings)))
     return weights
 
 
-def mark(folder):
-    """Mark a dozen demonstrations where the hand is at the object, off by at most a frame."""
+def mark(folder, ways=()):
+    """
+    Mark a dozen demonstrations, off by at most a frame: where the object comes to rest by the way.
+
+    :param ways: places (2,) m; without any the mark is where the hand is at the object.
+    """
     store, rng, marks = open_recordings([folder]), np.random.default_rng(0), {}
     for i in range(len(store)):
         episode = store[i]
-        places = episode.object_pixels[:, 0]
-        way = np.linalg.norm(places - places[0], axis=1)
-        if len(marks) < MARKED and episode.outcome == 'success':
-            t = int((way > MOVED).argmax()) - 1 + int(rng.integers(-1, 2))
-            t = int(np.clip(t, 1, len(way) - 2))
-            marks[i] = [(t, t)]
+        if episode.outcome != 'success':
+            continue
+        if ways:
+            at = [_arrival(episode.object_poses[:, 0, :2], way) for way in ways]
+        else:
+            places = episode.object_pixels[:, 0]
+            at = [int((np.linalg.norm(places - places[0], axis=1) > MOVED).argmax()) - 1]
+        if None not in at and at == sorted({*at}):
+            marks[i] = [(t, t) for t in np.clip(
+                at + rng.integers(0 if ways else -1, 2, len(at)), 1, len(episode) - 2).tolist()]
+        if len(marks) == MARKED:
+            break
     path = Path(folder, 'marks.json')
     write_marks(path, store, [folder], marks)
     return path
 
 
-def run_scenes(args, weights):
-    """Run the methods in the scenes that have a goal; what was run is not run again."""
-    with tqdm(total=args.scenes * len(args.tasks), unit='scene') as bar:
-        for task in args.tasks:
-            (path, done), seed, count = read_rows(args.runs, task), FIRST_SCENE, 0
-            while count < args.scenes:
-                rows = done.setdefault(seed, {})
-                for method in args.methods:
-                    if method not in rows:
-                        rows[method] = run_scene(
-                            task, method, seed, weights['forward'], weights[task], args.runs)
-                        write_atomically(path, json.dumps(done) + '\n')
-                solved = all(rows.values())
-                count, seed = count + solved, seed + 1
-                bar.update(solved)
+def _arrival(places, way):
+    """Return the frame in which an object comes to where it rests longest; None without a rest."""
+    rests = np.linalg.norm(np.diff(places, axis=0), axis=1) < RESTS
+    there = np.flatnonzero(rests & (np.linalg.norm(places[:-1] - way, axis=1) < AT))
+    if not len(there):
+        return None
+    longest = max(np.split(there, np.flatnonzero(np.diff(there) > 1) + 1), key=len)
+    away = np.linalg.norm(places[:longest[0]] - places[longest[-1]], axis=1) > JOLT
+    return int(np.flatnonzero(away).max(initial=-1)) + 1
+
+
+def run_scenes(args, task, weights, training=0):
+    """Run methods in the scenes that have a goal; what was run is not run again."""
+    path, done = read_rows(args.runs, task)
+    chosen = [method for method in args.methods if method in weights
+              and (task in WAYS or method not in WITH_WAYS)]
+    seed, count = FIRST_SCENE, 0
+    with tqdm(total=args.scenes, unit='scene', desc=f'{task}: {", ".join(chosen)}') as bar:
+        while chosen and count < args.scenes:
+            rows = done.setdefault(seed, {})
+            for method in chosen:
+                name = method + f' {training}' * (training > 0)
+                if name not in rows and None not in rows.values():
+                    found = run_scene(task, method, seed, weights[method], Path(args.runs, task))
+                    rows[name] = found and {**found, 'training': training}
+                    write_atomically(path, json.dumps(done) + '\n')
+            solved = None not in rows.values()
+            count, seed = count + solved, seed + 1
+            bar.update(solved)
+            write_results(Path(args.runs), Path(args.out), args)
 
 
 def read_rows(runs, task):
@@ -150,86 +212,32 @@ def read_rows(runs, task):
     return path, {int(seed): rows for seed, rows in found.items()}
 
 
-class Judged(MetaWorld):
-    """Meta-World, and what it says after every step."""
-
-    def reset(self, seed):
-        """Begin a scene."""
-        self.said = []
-        return super().reset(seed)
-
-    def step(self, action):
-        """Act, and note."""
-        seen = super().step(action)
-        self.said.append(self.succeeds())
-        return seen
-
-
-_world = lru_cache(Judged)
-
-
-def run_scene(task, method, seed, forward, predictor, runs):
-    """Run a method in a scene; return what came of it, None if the scene has no goal."""
-    world = _world(task, IMAGE_SIZE)
-    try:
-        pictures = act(world, method, seed, _planner(forward, PLANNER), predictor)
-    except SceneError:
-        return None
-    start = pictures.pop()
-    if method == 'subgoal' and seed < FIRST_SCENE + STRIPS:
-        cv2.imwrite(str(Path(runs, task, f'strip_{seed}.png')), grid([pictures])[..., ::-1])
-    goal = world.goal().object_poses[0, :3] - world.goal_places()[0]
-    return {'task': task, 'method': method, 'seed': seed, 'ends': bool(world.succeeds()),
-            'ever': any(world.said), 'steps': len(world.said),
-            'goal_cm': round(100 * float(np.linalg.norm(goal)), 2), 'start_cm': start,
-            'final_cm': round(100 * float(world.distances()[0]), 2)}
-
-
-def act(world, method, seed, mpc, predictor):
-    """Act as long as a goal may take; return pictures of start, subgoals, end and goal, cm."""
-    budget = step_budget(1)
-    if method in ('direct', 'subgoal'):
-        predict = _predictor(predictor) if method == 'subgoal' else None
-        ran = run_episode(world, mpc, Method(method), budget, seed, predict, REACHED)
-        frames, distance = ran.frames, ran.distances[0, 0]
-        shown = [frames[0], *(subgoal.image for subgoal in ran.subgoals), frames[-1]]
-    else:
-        first = world.reset(seed)
-        distance, rng = world.distances()[0], np.random.default_rng(seed)
-        actions = push_to_goal(world) if method == 'straight' else (
-            np.append(rng.uniform(-1, 1, 3) * ACTION_LIMIT, 0) for _ in range(budget))
-        last = first
-        for _, action in zip(range(budget), actions):
-            last = world.step(action)
-        shown = [first.image, last.image]
-    return [*(enlarge(image, SCALE) for image in (*shown, world.goal().image)),
-            round(100 * float(distance), 2)]
-
-
 def write_results(runs, out, args):
-    """Write all rows, the table and the strips."""
+    """Write all rows and the table, as far as scenes were run."""
     rows = [row for task in args.tasks for rows in read_rows(runs, task)[1].values()
             for row in rows.values() if row]
+    if not rows:
+        return
     write_rows(out / 'worlds_loop.json', rows)
-    strips = [[cv2.imread(str(path))] for task in args.tasks
-              for path in sorted(Path(runs, task).glob('strip_*.png'))]
-    if strips:
-        cv2.imwrite(str(out / 'worlds_loop.png'), grid(strips))
     write_atomically(out / 'worlds_loop.md', render(
         'worlds/templates/worlds_loop.md.j2', table=pd.DataFrame(summarise(rows)), marked=MARKED,
-        **asdict(args)))
-    print(out / 'worlds_loop.md')
+        episodes=args.episodes, steps=args.steps, predictor_steps=args.predictor_steps,
+        budget=BUDGETS['push-wall-v3']))
 
 
 def summarise(rows):
     """Return a line for each task and method: shares and distances with 95% intervals."""
     found = []
     for (task, method), same in pd.DataFrame(rows).groupby(['task', 'method'], sort=False):
-        line = {'task': task, 'method': method, 'scenes': len(same)}
+        scenes = same.groupby('seed', sort=False)
+        line = {'task': task, 'method': method, 'scenes': scenes.ngroups,
+                'trainings': same['training'].nunique() if method in LEARNED else ''}
         for name in ('ends', 'ever'):
-            line[name] = share(share_interval(same[name].tolist()))
+            mean = scenes[name].mean()
+            line[name] = share(share_interval(mean.tolist()) if set(mean) <= {0, 1}
+                               else mean_interval(mean.tolist()))
         for name in ('start_cm', 'final_cm'):
-            value, low, high = mean_interval(same[name].tolist())
+            value, low, high = mean_interval(scenes[name].mean().tolist())
             line[name] = f'{value:.1f} ({low:.1f} to {high:.1f})'
         found.append({**line, 'steps': f'{np.mean(same["steps"]):.0f}'})
     return found

@@ -11,6 +11,7 @@ from importlib import import_module
 import numpy as np
 from sim_bridge.demonstrations import demonstrate
 from sim_bridge.world.camera import Camera, Renderer
+from sim_bridge.world.gap import Gap
 from tap_ros.base.errors import ConfigError, SceneError
 
 TASKS = ('button', 'cube', 'drawer', 'window')
@@ -41,6 +42,7 @@ class OGBench:
         self.env.reset(seed=0)  # it makes the model
         self.camera_matrix = Camera(image_size, image_size, fovy=FOVY).K
         self._renderer = Renderer(self.env._model, image_size, image_size)
+        self._gap = Gap(self.env._model, 'ur5e/')
 
     demonstrate = demonstrate
 
@@ -81,6 +83,12 @@ class OGBench:
         return np.array(self._info[{
             'button': f'privileged/button_{number}_pos', 'cube': 'privileged/block_0_pos'}.get(
                 kind, f'privileged/{kind}_pos')])
+
+    def gap(self):
+        """Return how far the robot is from that, m."""
+        return self._gap(self.env._data, {
+            'button': f'button_{self.env._target_button}', 'cube': 'object_0',
+            'drawer': 'drawer_link', 'window': 'windowb_a'}[self.task_name])
 
     def picture(self):
         """Return what a camera in front of the robot sees."""

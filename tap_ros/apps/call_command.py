@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+import time
 from typing import Annotated, Literal
 
 import numpy as np
@@ -12,10 +13,12 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
 from tap_ros.base.text import escaped
+from tap_ros.ros.calls import CallError
 from tap_ros.ros.client import Client
-from tap_ros.ros.requests import request_fields, subgoals_of
+from tap_ros.ros.requests import NOTHING_CAME, request_fields, subgoals_of
 from tyro import conf
 
+ASK_AGAIN_S = 0.5
 _Pixels = conf.arg(metavar='U,V [U,V ...]', help_behavior_hint='(default: of the topics)')
 
 
@@ -25,7 +28,7 @@ class Options:
     Options of the command.
 
     :param start: picture file to predict from; without it the newest picture of the camera.
-    :param goal: likewise; without it the newest one on goal/image.
+    :param goal: picture file of the goal; without it the newest one on goal/image.
     :param objects: where objects are in the start picture: column and row of each. Without a start
         picture those of its topic are used.
     :param goal_objects: where the same objects are in the goal picture, in the same order.
@@ -34,7 +37,7 @@ class Options:
     :param recursion: subgoals in a row.
     :param seed: of z; the same one draws the same samples.
     :param namespace: of the node.
-    :param timeout: s to wait for the node and its answer.
+    :param timeout: s to wait for the node, the first pictures and the answer.
     :param out: PNG file to write: subgoals, with maps of where objects are then, and the picture
         files that were given.
     """
@@ -64,11 +67,21 @@ def run(args: Options) -> None:
     pictures, pixels = read_inputs(
         {'start': args.start, 'goal': args.goal},
         {'--objects': args.objects, '--goal-objects': args.goal_objects})
+    deadline = time.monotonic() + args.timeout
     with Client(args.namespace, args.timeout) as client:
-        response = client.call('predict', **request_fields(
-            **pictures, **{f'{name}_objects': places for name, places in pixels.items()}),
-            mode='' if args.mode == 'auto' else args.mode, num_samples=args.samples,
-            recursion_depth=args.recursion, seed=args.seed)
+        fields = request_fields(
+            **pictures, **{f'{name}_objects': places for name, places in pixels.items()})
+        response = None
+        while response is None:
+            try:
+                response = client.call(
+                    'predict', max(1.0, deadline - time.monotonic()), **fields,
+                    mode='' if args.mode == 'auto' else args.mode, num_samples=args.samples,
+                    recursion_depth=args.recursion, seed=args.seed)
+            except CallError as error:  # the first picture may be yet to come
+                if NOTHING_CAME not in str(error) or time.monotonic() > deadline:
+                    raise
+                time.sleep(ASK_AGAIN_S)
     print(f'{escaped(response.message, 500)}; {response.model_time_ms:.0f} ms')
     subgoals = subgoals_of(response)
     names = response.subgoals[0].object_names

@@ -17,10 +17,11 @@ import sys
 from typing import Annotated, Any, NamedTuple, TypeAlias
 import warnings
 
+from tap_ros.base.contract import VERSION
 from tap_ros.base.errors import TapError
 from tap_ros.base.interrupts import leave_at_once
 from tap_ros.base.options import parse
-from tap_ros.base.text import escaped
+from tap_ros.base.text import escaped, meant
 from tyro import conf
 
 EXTRAS = {  # what only some commands need, and what pip calls it
@@ -60,9 +61,13 @@ def main(line: CommandLine, arguments: Sequence[str] | None = None) -> int:
 
     :param arguments: list of strings; by default those of the process.
     :return: exit code: 0, 1 after an error that was named, 130 when interrupted.
-    :raises SystemExit: as options.parse, for words that are no command or option and for --help.
+    :raises SystemExit: with code 2 for words that are no command or option, which are printed;
+        with code 0 after --help.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments == ['--version']:
+        print(f'tap_ros {VERSION}')
+        return 0
     warnings.formatwarning = lambda message, *_, **__: f'warning: {message}\n'
     try:
         run, options = read(line, arguments)
@@ -96,9 +101,11 @@ def read(line: CommandLine, arguments: Sequence[str]) -> tuple[Callable[[Any], A
 
     :param arguments: list of strings.
     :return: its function, and the options to call it with.
-    :raises SystemExit: as options.parse.
+    :raises SystemExit: with code 2 for words that are no command or option, which are printed;
+        with code 0 after --help, and after what prints shell completion.
     """
     words = list(arguments)
+    _check(line.commands, words)
     completion = bool(words) and words[0].startswith('--tyro-')
     found: dict[Any, Command] = {}
     # What is completed is a name that a shell can look up, not three words.
@@ -109,6 +116,19 @@ def read(line: CommandLine, arguments: Sequence[str]) -> tuple[Callable[[Any], A
         options = parse(command.options, words[2:], f'{line.prog} {words[0]} {words[1]}',
                         default=command.defaults(options))
     return command.run, options
+
+
+def _check(commands: Commands, words: Sequence[str]) -> None:
+    """Exit with code 2 where a word is no command; say which is nearest, and all that are."""
+    word = words[0].replace('_', '-') if words else '-'
+    if word in commands:
+        inner = commands[word][1]
+        if not callable(inner):
+            _check(inner, words[1:])
+    elif not word.startswith('-'):
+        print(f'error: command {escaped(words[0], 60)!r} is unknown; {meant(word, commands)}'
+              f'valid: {", ".join(commands)}', file=sys.stderr)
+        raise SystemExit(2)
 
 
 def _union(commands: Commands, words: Sequence[str] | None, found: dict[Any, Command]) -> Any:

@@ -19,7 +19,7 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.training.forward_scores import measure_maps, measure_pictures, MOVED_PIXELS
 from tap_ros.training.frames import FilledStore
 from tap_ros.training.split import split_as_trained, TEST_FRACTION, with_masks
-from tap_ros.weights import FORWARD_MODEL
+from tap_ros.weights import find_forward_model, FORWARD_MODEL
 from tap_ros.weights.weights import load_weights
 
 # Of a measurement its metric and its method; of predicted pictures what they are compared with.
@@ -48,7 +48,7 @@ class Options:
 
     :param recordings: bag folders; each is scored on its own: by object pixels, else by pictures.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
-    :param weights: of a forward model.
+    :param weights: of a forward model: a file, or 'push', the shipped one.
     :param test_fraction: 1: all episodes, not only those that training held out; else the share
         of these, of weights that do not tell which they are.
     :param device: cpu or cuda.
@@ -69,8 +69,9 @@ def run(args: Options) -> None:
 
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
-    model = LearnedForwardModel.load(args.weights, args.device)
-    _, _, training = load_weights(args.weights, 'forward_model')
+    weights = find_forward_model(args.weights)
+    model = LearnedForwardModel.load(weights, args.device)
+    _, _, training = load_weights(weights, 'forward_model')
     rows = []
     for recording in args.recordings:
         bags = find_bags(recording)

@@ -20,7 +20,7 @@ from tap_ros.recording.bags import find_bags, list_topics
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.reading import reading_of, ReadingOptions
-from tap_ros.training.split import split_episodes, warn_if_few
+from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few
 from tyro import conf
 
 
@@ -33,12 +33,14 @@ class Options:
     :param picture: write film strips of the first episodes to this PNG.
     :param episodes: episodes in the picture.
     :param robot_mask: tint what the robot masks mark: the arm red, the hand blue.
+    :param test_fraction: held-out share of the demonstrations, as of `train`.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
     picture: File = ''
     episodes: int = 8
     robot_mask: bool = False
+    test_fraction: float = TEST_FRACTION
     reading: ReadingOptions = ReadingOptions()
 
 
@@ -86,7 +88,7 @@ def run(args: Options) -> None:
         write_atomically(args.picture, png_bytes(grid(strips, scale=2)))
         print(f'picture     {escaped(args.picture)}')
     check_trainable(store.image_size, 'the predictor')
-    training, held_out = split_episodes(store)
+    training, held_out = split_episodes(store, args.test_fraction)
     print(f'train       {len(training)} episodes to learn from, {len(held_out)} held out')
     warn_if_few(held_out)
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File, Folder
+from tap_ros.base.progress import Progress
 from tap_ros.base.text import listing
 from tap_ros.evaluation.intervals import share_interval
 from tap_ros.images.drawing import png_bytes
@@ -26,7 +27,6 @@ from tap_ros.recording.metadata import FILE_NAME
 from tap_ros.recording.reading import Reading, Topics
 from tap_ros.training.films import film_together, signals_like
 from tap_ros.training.labels import Film, label, Labels, SIZE
-from tqdm import tqdm
 from tyro import conf
 
 WITHIN_S = (0.3, 0.5, 1.0)  # of which the share of labels is told
@@ -116,7 +116,7 @@ def describe_all(recordings: Paths, image_topics: Sequence[str],
     store, *beside = (open_recordings(bags, reading=Reading(
         image_topic=topic, crop='whole', size=SIZE)) for topic in image_topics or ('',))
     names = signals_like(store, signals)
-    return store, [film_together(store, i, beside, names) for i in tqdm(
+    return store, [film_together(store, i, beside, names) for i in Progress(
         range(len(store)), desc='describing', unit='demonstration', delay=1)]
 
 

@@ -5,7 +5,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from http import HTTPStatus
-from importlib.resources import files
 import json
 from pathlib import Path
 from typing import Annotated
@@ -57,7 +56,7 @@ class MarkServer(PageServer):
 
     def __init__(self, marking: Marking, port: int = 0, part: str = '',
                  options: Sequence[str] = ()) -> None:
-        super().__init__(files('tap_ros.apps').joinpath('mark_page'), port=port)
+        super().__init__('mark_page', port=port)
         self.marking, self._options = marking, options
         self._full_size = FullSize(marking.store, part)
 

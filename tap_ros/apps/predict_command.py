@@ -41,7 +41,7 @@ class Options:
     Options of the command.
 
     :param start: picture file: JPEG, PNG or WebP.
-    :param goal: likewise; left out for weights that predict from the start alone.
+    :param goal: picture file of the goal; left out for weights that predict from the start alone.
     :param objects: where the objects are in the start picture: column and row of each, in the
         pixels of the file.
     :param goal_objects: where the same objects are in the goal picture, in the same order.

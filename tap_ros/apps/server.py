@@ -11,7 +11,7 @@ another machine needs a token. Connections are few and end in time.
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
-from importlib.resources.abc import Traversable
+from importlib.resources import files
 import ipaddress
 import secrets
 import socket
@@ -41,7 +41,8 @@ class PageServer(ThreadingMixIn, TCPServer):
     """
     Serves the files of a page; serve_forever answers, each connection in a thread.
 
-    :param page: folder of the files, index.html among them.
+    :param page: folder of the files in this one, index.html among them, besides those that all
+        pages share.
     :param host: address to listen at.
     :param port: to listen at; 0: any that is free.
     :param token: that browsers must know; '' where host is of this machine alone: none is needed,
@@ -53,13 +54,15 @@ class PageServer(ThreadingMixIn, TCPServer):
     allow_reuse_address = daemon_threads = True
     request_queue_size = MAX_CONNECTIONS
 
-    def __init__(self, page: Traversable, host: str = '127.0.0.1', port: int = 0,
+    def __init__(self, page: str, host: str = '127.0.0.1', port: int = 0,
                  token: str = '') -> None:
         if not host:
             raise ConfigError('host: is empty; name an address, such as 127.0.0.1')
         self.host = host
         self.token = token or ('' if is_loopback(host) else secrets.token_urlsafe(16))
-        self.files = {file.name: file.read_bytes() for file in page.iterdir() if file.is_file()}
+        self.files = {file.name: file.read_bytes() for folder in ('shared_page', page)
+                      for file in files('tap_ros.apps').joinpath(folder).iterdir()
+                      if file.is_file()}
         self.ends: dict[socket.socket, float] = {}  # s, monotonic, of connections but WebSockets
         try:
             self.address_family, *_, place = socket.getaddrinfo(

@@ -48,6 +48,7 @@ ROBOT_MASK_FREE = 0  # neither robot nor shadow
 ROBOT_MASK_HAND = 128  # the hand (gripper) or its shadow
 ROBOT_MASK_ARM = 255  # the arm or its shadow
 ROBOT_MASKS = ('none', 'arm', 'all')  # what is taken for hidden: nothing, arm, arm and hand
+VERSION = '0.1.0'  # of both packages
 MODES = ('bidirectional', 'forward')  # of predictors: between start and goal, or after the start
 
 # Module and class of each node, by the name of the node and of its executable.

@@ -55,8 +55,8 @@ def load_plugin(group: str, name: str) -> Any:
     :param group: one of BUILT_IN, such as 'tap_ros.arms'.
     :param name: of this package, or of an entry point of the group; this package's go first.
     :return: the class or object.
-    :raises ConfigError: for an unknown name; it names the nearest one and all valid ones. Likewise
-        for an entry point that cannot be imported, or is no such thing; it names its package.
+    :raises ConfigError: for an unknown name; it names the nearest one and all valid ones. For an
+        entry point that cannot be imported, or is no such thing, it names its package.
     """
     kind = group.partition('.')[2].removesuffix('s').replace('_', ' ')
     place = BUILT_IN[group].get(name)

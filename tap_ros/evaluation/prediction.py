@@ -51,9 +51,10 @@ class EpisodeScores:
         differs from every input (losses.changed_pixels): what copying or leaving out does not
         give; NaN where there are none.
     :param bottleneck: (N,), see bottleneck.score_bottlenecks; NaN where it is undefined.
-    :param object_mass: (N,), likewise; below bottleneck.VISIBLE an object is left out.
+    :param object_mass: (N,), NaN where it is undefined; below bottleneck.VISIBLE an object is
+        left out.
     :param hand: (N,), how much of the hand is shown, see shown.ShownScorer; NaN where unknown.
-    :param objects: (N,), likewise of the objects.
+    :param objects: (N,), how much of the objects is shown; NaN where unknown.
     :param copying: (N,), error of the nearer input against the frame of match_step.
     :param at_mark: (N,), error against the marked frame, of several the one nearest to match_step;
         NaN where none is marked.

@@ -34,7 +34,8 @@ def draw_strips(network: PredictorNetwork | Predictor, store: EpisodeStore,
     prediction, matched frame, goal if one is given; and the prediction with its object maps where
     the objects are known and no pixel is new.
 
-    :param network: as for prediction.evaluate; filled: likewise.
+    :param network: PredictorNetwork, or another Predictor.
+    :param filled: the recordings without the robot, for targets; None: as they are.
     :param goal_picture: see batches.make_batch.
     :param large: of each episode the pictures to draw instead, in that order, of any size.
     :return: uint8 (height, width, 3).

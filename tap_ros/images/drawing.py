@@ -16,7 +16,7 @@ OBJECT_COLOURS = (  # rgb, one per object; colour-blind readers tell them apart 
     (255, 176, 0), (100, 143, 255), (220, 38, 127), (0, 158, 115))
 GAP = 2  # white pixels between panels
 MARGIN = 8  # pixels outside a picture from where no mark reaches into it
-LARGEST = 640  # px; larger pictures are made smaller for a page
+LARGEST = 1280  # px; larger pictures are made smaller for a page
 LOSSLESS = 256  # px; larger ones are sent as JPEG
 HALO_STD, HALO = 1.3, 0.6  # pixels, and strength, of the glow around a map: sharp ones are tiny
 

@@ -39,6 +39,7 @@ from tap_ros.planning.table import (
     shifted,
     Table,
 )
+from tap_ros.weights import find_forward_model
 from tap_ros.weights.devices import has_bfloat16, placed
 from tap_ros.weights.weights import load_weights, make_network
 import torch
@@ -70,7 +71,7 @@ class ForwardModelConfig:
     # what the pictures are without, see robot_mask.hidden_pixels
     robot_mask: RobotMask = 'none'
     crop: str = ''  # of the camera's pictures, see crop.Crop
-    crop_size: int = 0  # likewise, Crop.size
+    crop_size: int = 0  # Crop.size
     camera_size: tuple[int, int] = (0, 0)  # (0, 0): unknown
 
     def __post_init__(self) -> None:
@@ -135,13 +136,16 @@ class LearnedForwardModel(nn.Module):
         """
         Load a trained forward model, ready to predict.
 
-        :param path: safetensors file of kind 'forward_model'.
+        :param path: name of the shipped one, 'push', or a safetensors file.
         :param simulator: is not needed; forward models are all loaded alike.
         :param precision: of the push net: 'float32', 'bfloat16', or 'auto': bfloat16 where the
             device has instructions for it.
         :return: the model in evaluation mode.
-        :raises WeightsError: for a missing or damaged file, or one of another kind.
+        :raises WeightsError: for an unknown name, a missing or damaged file, or one of another
+            kind.
+        :raises ConfigError: for the name of a predictor.
         """
+        path = find_forward_model(path)
         values, state, _ = load_weights(path, 'forward_model')
         model = make_network(cls, ForwardModelConfig, values, state, path)
         model = model.to(device).eval().requires_grad_(False)

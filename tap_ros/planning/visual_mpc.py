@@ -23,7 +23,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.base.errors import PlanningError
-from tap_ros.base.plugins import load_plugin
+from tap_ros.base.plugins import load_plugin, names
 from tap_ros.base.search import finite
 from tap_ros.images.pixels import check_image, check_pixels, in_picture, to_float
 from tap_ros.planning.action_sequences import (
@@ -44,6 +44,7 @@ from tap_ros.planning.protocols import ForwardModel, Problem, Solution, Solver
 from tap_ros.planning.rollouts import Rollouts, Start, TimeLimit, to_numpy
 import torch
 
+MODELS = 'tap_ros.forward_models'
 WARM_STD = 0.5  # share of the first deviation that a search around the last plan begins with
 SHORT = 0.02  # m; a descent of which more is missing has met something,
 STILL = 0.9  # or of which this share is, where the arm comes down in small steps
@@ -170,13 +171,19 @@ class VisualMPC:
     def load(cls, path: str | Path, config: VisualMPCConfig | None = None,
              device: torch.device | str = 'cpu') -> Self:
         """
-        Load a learned forward model's weights.
+        Make a planner with a forward model by name or file.
 
-        :param path: safetensors file of kind 'forward_model', such as weights.FORWARD_MODEL.
+        :param path: 'push', the shipped one, or a task that it is for; a safetensors file; or
+            NAME:ARGUMENT of a forward model of another package, which loads ARGUMENT.
         :param config: of the search; None: the default.
         :param device: where to predict, 'cpu' or 'cuda'.
-        :raises WeightsError: for a file that is missing, damaged or of another kind.
+        :raises WeightsError: for an unknown name, or a file that is missing, damaged or of another
+            kind.
+        :raises ConfigError: for the name of a predictor.
         """
+        name, _, argument = str(path).partition(':')
+        if argument and name in names(MODELS):
+            return cls(load_plugin(MODELS, name).load(argument, device), config)
         return cls(LearnedForwardModel.load(path, device), config)
 
     @property

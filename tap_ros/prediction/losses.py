@@ -28,7 +28,7 @@ def changed_pixels(targets: torch.Tensor, context: torch.Tensor) -> torch.Tensor
     """
     Find the pixels of a frame that differ from every input: what copying in place cannot give.
 
-    :param targets: (B, 3, H, W) in [-1, 1]; context: (B, C, 3, H, W) likewise.
+    :param targets: (B, 3, H, W) in [-1, 1]; context: (B, C, 3, H, W) in [-1, 1].
     :return: bool (B, 1, H, W).
     """
     difference = (targets[:, None] - context).abs().amax(2, keepdim=True)  # B, C, 1, H, W
@@ -112,7 +112,7 @@ def bell_preference(times: torch.Tensor, first: torch.Tensor | float,
     w(t) = exp(-(t - m)^2 / (2 sigma^2)), m the middle, sigma 1.110 of half the range (section 4).
 
     :param times: (B, T) times of the targets.
-    :param first: (B, 1) or number, the earliest target time; last: likewise, the latest.
+    :param first: (B, 1) or number, the earliest target time; last: the latest one.
     :return: w(t), (B, T).
     """
     half_range = torch.as_tensor((last - first) / 2, dtype=torch.float32).clamp(min=0.5)

@@ -76,7 +76,12 @@ class NearestKeyframe(Predictor):
         return cls(store, read_marks(files[0], store).episodes if files else None)
 
     def predict_together(self, requests: Sequence[Request]) -> list[list[Subgoal]]:
-        """Answer requests, see Predictor; each gets one sample."""
+        """
+        Answer requests; each gets one sample.
+
+        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
+        :raises ConfigError: if a count is below 1, or a goal is missing.
+        """
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> list[Subgoal]:

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any, cast, Protocol
 
 import numpy as np
-from tap_ros.base.errors import ConfigError, ImageError, WeightsError
+from tap_ros.base.errors import ConfigError, ImageError
 from tap_ros.base.plugins import load_plugin, names
-from tap_ros.base.text import escaped, meant
 from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image, check_pixels
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.weights import find_predictor, PREDICTORS
+from tap_ros.weights import find_predictor
 
 GROUP = 'tap_ros.predictors'
 
@@ -70,7 +69,8 @@ class Predictor(Protocol):
 
         :param requests: their fields are the arguments of predict.
         :return: for each what predict returns.
-        :raises ImageError: as predict; ConfigError: likewise.
+        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
+        :raises ConfigError: if a count is below 1, or a goal is missing or too much.
         """
         ...
 
@@ -82,11 +82,11 @@ class Predictor(Protocol):
 
         :param start: uint8 (H, W, 3) rgb, what is seen now; (H, W) is image_size, or larger and of
             that shape, see full_size.
-        :param goal: likewise, what is to be; None in mode 'forward'.
+        :param goal: uint8 (H, W, 3) rgb, what is to be; None in mode 'forward'.
         :param start_pixels: (K, 2) numbers, (u, v) of each object in the start picture; (0, 0) is
             the centre of the top-left pixel. None: no objects.
-        :param goal_pixels: likewise, of the same objects in the goal picture; None in mode
-            'forward'.
+        :param goal_pixels: (K, 2) numbers, (u, v) of the same objects in the goal picture; None in
+            mode 'forward'.
         :param num_samples: how many to draw; a predictor without random numbers answers one.
         :param recursion_depth: how many subgoals in a row, at least 1.
         :param seed: of what is random; the same arguments give the same answer.
@@ -103,28 +103,25 @@ class Predictor(Protocol):
 
 def load_predictor(text: str | Path, device: Any = 'cpu') -> Predictor:
     """
-    Load a predictor by name or file.
+    Load a predictor by name or file, as the parameter weights of predictor_node names it.
 
     :param text: name of shipped weights, such as 'push2'; a weights file; or NAME:ARGUMENT of
         another predictor, such as 'nearest_keyframe:bags/push2'.
     :param device: torch device or its name.
-    :raises WeightsError: if weights are missing, damaged or for something else.
-    :raises TapError: as the predictor's own load.
+    :raises WeightsError: if weights are unknown, missing, damaged or for something else.
+    :raises TapError: for an argument that the other predictor cannot use.
     """
     name, _, argument = str(text).partition(':')
     if name in names(GROUP):
         return cast(Predictor, load_plugin(GROUP, name).load(argument, device))
-    if not find_predictor(text).exists() and Path(text).name == str(text) == Path(text).stem:
-        raise WeightsError(
-            f'{escaped(text)}: no such weights file; '
-            f'{meant(name, [*PREDICTORS, *names(GROUP)])}valid: {", ".join(PREDICTORS)}, a '
-            f'.safetensors file, or NAME:ARGUMENT with NAME one of {", ".join(names(GROUP))}')
-    return cast(Predictor, load_plugin(GROUP, 'tap').load(text, device))
+    file = find_predictor(text, names(GROUP))
+    return cast(Predictor, load_plugin(GROUP, 'tap').load(file, device))
 
 
 def predictor_files(text: str) -> list[Path]:
     """Return the weights files that a text of load_predictor names; none of other predictors."""
-    return [] if text.partition(':')[0] in names(GROUP) else [find_predictor(text)]
+    return [] if text.partition(':')[0] in names(GROUP) else [
+        find_predictor(text, names(GROUP))]
 
 
 def check_request(request: Request, mode: str,
@@ -132,10 +129,12 @@ def check_request(request: Request, mode: str,
     """
     Check a request.
 
-    :param mode: of the predictor; image_size: likewise.
+    :param mode: of the predictor, 'bidirectional' or 'forward'.
+    :param image_size: (height, width) of the pictures that it takes.
     :return: pictures (C, H, W, 3) and positions (C, K, 2): of the start, and of the goal if the
         mode is bidirectional.
-    :raises ImageError: as Predictor.predict_together; ConfigError: likewise.
+    :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
+    :raises ConfigError: if a count is below 1, or a goal is missing or too much.
     """
     for name in ('num_samples', 'recursion_depth'):
         if getattr(request, name) < 1:

@@ -21,7 +21,7 @@ def ends_of(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """
     Return what start and goal are compared by.
 
-    :param start: uint8 (H, W, 3) of any size; goal: likewise, also of another.
+    :param start: uint8 (H, W, 3) of any size; goal: uint8 (h, w, 3), also of another size.
     :return: uint8 (2, SIDE, SIDE, 3).
     """
     return np.stack([cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
@@ -34,7 +34,7 @@ def nearest(asked: np.ndarray, known: np.ndarray, count: int,
     Find the demonstrations that are most alike.
 
     :param asked: uint8 (Q, 2, SIDE, SIDE, 3), of ends_of.
-    :param known: uint8 (N, 2, SIDE, SIDE, 3), likewise, N of at least 1.
+    :param known: uint8 (N, 2, SIDE, SIDE, 3), start and goal of others, N of at least 1.
     :param count: of demonstrations for each question; fewer where there are fewer.
     :param exclude: (Q,) the index that each question must not find, for example its own.
     :return: their indices int64 (Q, count) and distances float64 (Q, count), the nearest first.

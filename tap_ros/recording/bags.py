@@ -52,7 +52,7 @@ def known_bags(paths: Paths) -> list[Bag]:
     """
     Find recordings as find_bags does; one that was found before is the same Bag, opened once.
 
-    :raises RecordingError: likewise.
+    :raises RecordingError: if there is none, or one cannot be read.
     """
     return [_known(bag.files, tuple(map(stats_of, bag.files))) for bag in find_bags(paths)]
 

@@ -36,6 +36,7 @@ from tap_ros.base.errors import (
     RecordingError,
     RecordingWarning,
 )
+from tap_ros.base.progress import Progress
 from tap_ros.base.text import escaped
 from tap_ros.images.crop import CENTRE, check_trainable
 from tap_ros.recording.align import assemble, runs_of
@@ -47,7 +48,6 @@ from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.topic_choice import Bag, list_paths
-from tqdm import tqdm
 
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
 
@@ -60,7 +60,7 @@ class EpisodeStore:
     :param file_hashes: hex digests of the files, in order, and what else tells them apart.
     :param bags: that of each table.
     :ivar image_size: (height, width) of the frames.
-    :ivar camera_size: likewise, as they were recorded; None where that differs.
+    :ivar camera_size: (height, width) as they were recorded; None where that differs.
     :ivar cameras: topics of the cameras, sorted.
     :ivar commands: units of those to the arm; older recordings have metres in a control period.
     :ivar marked: whether marks tell episodes apart, in some of the recordings at least.
@@ -244,8 +244,8 @@ def _loaded(wanted: dict[Path, tuple[Bag, int, dict[str, str]]], reading: Readin
     works = [Work(str(bag.files[number]), _build, (bag.opened[number], folder, topics, reading))
              for folder, (bag, number, topics) in wanted.items() if not found[folder]]
     sizes = [os.stat(work.name).st_size for work in works]
-    with tqdm(total=sum(sizes), desc='decoding once', unit='B', unit_scale=True,
-              disable=not progress, delay=1) as bar:
+    with Progress(total=sum(sizes), desc='decoding once', unit='B', unit_scale=True,
+                  disable=not progress, delay=1) as bar:
         for work in _built(works, together=sum(sizes) > _ALONE_BYTES):
             folder = work.args[1]
             found[folder] = _load(folder, Path(work.name))

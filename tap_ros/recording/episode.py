@@ -44,7 +44,7 @@ class Episode:
     outcome: str = ''  # one of OUTCOMES
     # (T, H, W) uint8, ROBOT_MASK_FREE, _HAND or _ARM; None unless every frame has one
     robot_masks: np.ndarray | None = None
-    goal_mask: np.ndarray | None = None  # (H, W) uint8: likewise, of the picture of the goal
+    goal_mask: np.ndarray | None = None  # (H, W) uint8: of the picture of the goal
     signal_names: tuple[str, ...] = ()  # D, of whatever else was measured or commanded
     signals: np.ndarray | None = None  # (T, D) float32; NaN where unknown; None without names
 

@@ -157,7 +157,8 @@ def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[st
     Write a file of marks in one step, a mark a line.
 
     :param recordings: paths of the store.
-    :param episodes: as in Marks; names: likewise.
+    :param episodes: marks by the index of their episode.
+    :param names: of the marks of a demonstration, in their order.
     :raises StorageError: when it cannot be written; an existing file is then what it was.
     """
     numbers = numbered(store, recordings, Path(path).resolve().parent)

@@ -28,9 +28,10 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.ros.calls import call, CallError, Spinner
+from tap_ros.ros.goal_senders import CLIENT
 from tap_ros.ros.heartbeat import Liveness
 from tap_ros.ros.observations import Observations
-from tap_ros.ros.reaching import CANCEL, CLIENT, Goals, Reaching
+from tap_ros.ros.reaching import CANCEL, Goals, Reaching
 from tap_ros.ros.requests import (
     by_name,
     make_request,
@@ -171,17 +172,20 @@ class Client:
                 num_samples: int = 1, recursion_depth: int = 1, seed: int = 0, mode: str = '',
                 timeout_s: float | None = None) -> list[Subgoal]:
         """
-        Ask the predictor for subgoals, as SubgoalPredictor.predict in one process.
+        Ask predictor_node for subgoals.
 
-        :param start: (H, W, 3) uint8; None: the newest picture of the camera.
-        :param goal: likewise; None: the newest goal picture.
+        :param start: uint8 (H, W, 3) rgb; None: the newest picture of the camera.
+        :param goal: uint8 (H, W, 3) rgb; None: the newest goal picture.
         :param start_pixels: (K, 2) (u, v) of objects in the start picture; None: those of the
             topic where the picture is, else no maps.
-        :param goal_pixels: of the same objects in the goal picture.
+        :param goal_pixels: (K, 2), of the same objects in the goal picture.
+        :param num_samples: how many to draw, 1 to 100; recursion_depth: subgoals in a row, 1 to 8.
+        :param seed: of the samples.
         :param mode: 'bidirectional' or 'forward'; '': what the node has weights for.
         :return: list of Subgoal, earliest first, sample after sample; their mass is NaN. Objects
             of topics are in the order of the message.
-        :raises CallError: as call.
+        :raises CallError: when the node does not answer in time, leaves the ROS graph, or refuses.
+        :raises ConfigError: for pictures of another type or shape, and numbers out of range.
         """
         left = _countdown('predict', self._timeout(timeout_s))  # encoding takes its time
         fields = request_fields(
@@ -266,10 +270,13 @@ class Client:
         Have the tracker follow other objects {name: (u, v)}, clicked in the newest picture.
 
         :param stamp_ns: of the picture that was clicked: none that is older is used.
-        :raises CallError: with the reason, such as a click on the robot; then nothing changes.
+        :raises CallError: with the reason, such as a click on the robot. The objects that are not
+            refused are followed; where all are, those before.
         """
         u, v = pixels_of(list(by_name(pixels).values()), 'pixels').T.tolist()
-        self.call('select', names=list(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
+        answer = self.call('select', names=list(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
+        if len(answer.objects) < len(pixels):
+            raise CallError(answer.message)
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""
@@ -300,7 +307,13 @@ class Client:
 
     def goal(self, after_ns: int = -1, objects: bool = True,
              timeout_s: float | None = None) -> View:
-        """Return the newest goal picture, as camera does."""
+        """
+        Return the newest goal picture.
+
+        :param after_ns: wait for one that is stamped later than this.
+        :param objects: wait for one with the objects in it.
+        :raises CallError: naming the silent topic.
+        """
         return wait_for_view(
             self._observed('goal'), 'goal', after_ns, objects, self._timeout(timeout_s))
 

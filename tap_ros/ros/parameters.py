@@ -96,9 +96,9 @@ class CameraParameters:
     Where the camera is, and what counts of its camera_info.
 
     :param camera_x: x of the camera in the world, for robot_mask_node in base_frame, m.
-    :param camera_y: y of the camera, m; likewise.
-    :param camera_z: z of the camera, m; likewise. With 0 tracker_node takes camera/pose, or the
-        pose that tf_static tells; robot_mask_node does with x, y and z of 0.
+    :param camera_y: y of the camera in that frame, m.
+    :param camera_z: z of the camera in that frame, m. With 0 tracker_node takes camera/pose, or
+        the pose that tf_static tells; robot_mask_node does with x, y and z of 0.
     :param camera_qx: x of the quaternion that turns the camera's optical frame (z forward, x
         right, y down in the picture) into that frame.
     :param camera_qy: y of that quaternion.

@@ -20,15 +20,12 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from tap_msgs.action import ReachGoal
-from tap_ros.base.contract import NODE_CLASSES
 from tap_ros.ros.calls import call, CallError, log_error, POLL_S, wait_for_answer
+from tap_ros.ros.goal_senders import ACTION, FEEDBACK, listeners
 from tap_ros.ros.heartbeat import Liveness, Presence, publishers_present
-from tap_ros.ros.subscriptions import PROCESS_BYTES, processes, UNKNOWN
+from tap_ros.ros.subscriptions import PROCESS_BYTES, processes
 
-ACTION = 'reach_goal'
-STATUS, FEEDBACK = f'{ACTION}/_action/status', f'{ACTION}/_action/feedback'
-CANCEL = f'{ACTION}/_action/cancel_goal'
-CLIENT = 'tap_ros_client_'  # begins the name of a Client's own node
+STATUS, CANCEL = f'{ACTION}/_action/status', f'{ACTION}/_action/cancel_goal'
 ANSWER_S = 5.0  # until an answer to a goal is held to be lost, and the goal is sent anew
 CANCEL_S = 1.0  # until a cancel that is not answered is sent again
 LATE_S = 1.0  # that feedback may come after the result
@@ -63,7 +60,7 @@ class Goals:
 
     def new_id(self) -> Any:
         """Return the id of a goal; the planner watches whom its first bytes name."""
-        own = [process for process, names in _listeners(self.node).items()
+        own = [process for process, names in listeners(self.node).items()
                if self.node.get_fully_qualified_name() in names]
         sender = own[0] if len(own) == 1 else secrets.token_bytes(PROCESS_BYTES)
         goal_id = GoalInfo().goal_id
@@ -322,32 +319,3 @@ class Reaching:
             return outcome.result(max(deadline - time.monotonic(), POLL_S))
         except futures.TimeoutError as error:
             raise CallError(f'node {node.get_name()}: its callbacks keep it busy') from error
-
-
-def watch_sender(node: Node, goal_id: bytes) -> Callable[[], bool]:
-    """
-    Return a function that tells whether who has sent a goal has left the ROS graph.
-
-    A Client of this package is known by the id. Other programs listen to the feedback of their
-    goals: none may be left of those that did when the goal was accepted. Our own programs listen,
-    too, but have not sent a goal whose id names none of them.
-
-    :param node: that serves the goal; goal_id: its 16 bytes.
-    """
-    def there() -> set[bytes]:
-        return {*_listeners(node)}
-
-    def strangers() -> set[bytes]:
-        return {process for process, names in _listeners(node).items()
-                if any(name not in {UNKNOWN, *NODE_CLASSES} and not name.startswith(CLIENT)
-                       for name in (full.rpartition('/')[2] for full in names))}
-
-    sender = Presence(lambda: there() & {goal_id[:PROCESS_BYTES]})
-    others, listeners = Presence(strangers), Presence(there)
-    return lambda: sender.gone or (not sender.there and (others.gone or listeners.gone))
-
-
-def _listeners(node: Node) -> dict[bytes, set[str]]:
-    """Return the processes and nodes that take feedback, as those do who have sent a goal."""
-    return processes(
-        node.get_subscriptions_info_by_topic(node.resolve_topic_name(FEEDBACK)))

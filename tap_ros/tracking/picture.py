@@ -2,50 +2,97 @@
 # SPDX-License-Identifier: Apache-2.0
 """A picture as it is searched: colours, lightness counting less, and what the robot hides."""
 
+from copy import copy
+
 import cv2
 import numpy as np
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import View
 
-LIGHTNESS = 0.14  # weight of a step of L of OpenCV's 8-bit Lab, beside steps of a and b
 FEW = 4  # colours of a Palette, at most
-_LEVELS = np.arange(256)
-_WEIGHED = np.rint(np.outer(_LEVELS, (LIGHTNESS, 1, 1))).astype(np.uint8)[:, None]
-# The index of a colour has 3, 6 and 6 bits of L, a and b; and the middles of their bins.
-_INDEX = np.stack([_LEVELS >> 5 << 12, _LEVELS >> 2 << 6, _LEVELS >> 2], -1).astype(
-    np.uint16)[:, None]
-_AXES = np.ix_(*(np.float32(weight * ((np.arange(bins) + 0.5) * 256 / bins - 0.5))
-                 for bins, weight in ((8, LIGHTNESS), (64, 1), (64, 1))))
+NEAR = 15.4  # distance from a colour of an object below which it has that colour
+TONE = 0.03  # of the light or of a channel, from which on a change is taken back
+DARK, BRIGHT = 12, 243  # levels between which a change of light shows
+
+
+class Metric:
+    """
+    A distance of colours: the sum over the axes of OpenCV's 8-bit Lab.
+
+    :param lightness: weight of a step of L, beside steps of a and b.
+    :param bits: of L, a and b in the index of a colour, 16 at most.
+    """
+
+    def __init__(self, lightness: float, bits: tuple[int, int, int]) -> None:
+        levels, weights = np.arange(256), (lightness, 1, 1)
+        self.weighed = np.rint(np.outer(levels, weights)).astype(np.uint8)[:, None]
+        shifts = bits[1] + bits[2], bits[2], 0
+        self.index = np.stack([levels >> 8 - n << shift for n, shift in zip(bits, shifts)],
+                              -1).astype(np.uint16)[:, None]
+        # the middles of the bins
+        self.axes = np.ix_(*(np.float32(weight * ((np.arange(1 << n) + 0.5) * (256 >> n) - 0.5))
+                             for n, weight in zip(bits, weights)))
+
+
+# Shadows and the sides of a block change lightness first, so that it counts less, but for what
+# differs from the table in that alone.
+COLOUR, LIGHT = Metric(0.14, (3, 6, 6)), Metric(0.6, (6, 5, 5))
 
 
 class Picture:
     """
     A View at the working size.
 
-    Distances of colours are the sum over the axes of Lab, lightness weighed less: shadows and
-    the sides of a block change that first.
-
+    :param like: picture whose light this one is given, where all of it is lighter or of another
+        tint, or None.
     :ivar image: (h, w, 3) uint8.
+    :ivar metric: Metric of lab and index.
     :ivar lab: (h, w, 3) uint8, lightness already weighed.
     :ivar index: (h, w) uint16, into tables of Palette.
     :ivar hidden: (h, w) bool, the robot and its shadow.
     """
 
-    def __init__(self, view: View, plane: Plane) -> None:
+    def __init__(self, view: View, plane: Plane, like: 'Picture | None' = None) -> None:
         h, w = self.size = plane.working
         image = view.image
         if image.shape[:2] != self.size:
             smaller = image.shape[0] > h or image.shape[1] > w
             image = np.asarray(cv2.resize(
                 image, (w, h), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC))
-        self.image = image
-        lab = cv2.cvtColor(cv2.GaussianBlur(image, (3, 3), 0.7), cv2.COLOR_RGB2LAB)
-        self.lab = np.asarray(cv2.LUT(lab, _WEIGHED))
-        parts: list[np.ndarray] = [np.asarray(part) for part in cv2.split(cv2.LUT(lab, _INDEX))]
-        self.index: np.ndarray = np.bitwise_or(np.bitwise_or(parts[0], parts[1]), parts[2])
         mask = np.zeros(self.size, np.uint8) if view.robot_mask is None else view.robot_mask
         self.hidden = np.asarray(mask if mask.shape == self.size else cv2.resize(
             mask, (w, h), interpolation=cv2.INTER_NEAREST)) > 0
+        self.image = image if like is None else self._toned(image, like)
+        self._full = cv2.cvtColor(cv2.GaussianBlur(self.image, (3, 3), 0.7), cv2.COLOR_RGB2LAB)
+        self._made = {COLOUR: self}
+        self._weigh(COLOUR)
+
+    def _weigh(self, metric: Metric) -> None:
+        self.metric = metric
+        self.lab = np.asarray(cv2.LUT(self._full, metric.weighed))
+        L, a, b = (np.asarray(part) for part in cv2.split(cv2.LUT(self._full, metric.index)))
+        self.index: np.ndarray = np.bitwise_or(np.bitwise_or(L, a), b)
+
+    def by(self, metric: Metric) -> 'Picture':
+        """Return the same picture by another metric."""
+        if metric not in self._made:
+            made = self._made[metric] = copy(self)
+            made._weigh(metric)
+        return self._made[metric]
+
+    def _toned(self, image: np.ndarray, like: 'Picture') -> np.ndarray:
+        """Return an image in the light of another picture: most of both shows the same."""
+        here, there = image[::4, ::4], like.image[::4, ::4]
+        free = ~(self.hidden | like.hidden)[::4, ::4]
+        shown = [free & (part.min(-1) > DARK) & (part.max(-1) < BRIGHT) for part in (here, there)]
+        both = shown[0] & shown[1]
+        if both.sum() < 50:
+            return image
+        gain = np.median(there[both] / here[both], 0)
+        if (np.abs(np.log(gain)) < TONE).all():
+            return image
+        lut = np.rint(np.outer(np.arange(256), gain)).clip(0, 255).astype(np.uint8)[:, None]
+        return np.asarray(cv2.LUT(image, lut))
 
     def apart(self, other: 'Picture') -> np.ndarray:
         """Return the distance (h, w) float32 of the colours of each pixel."""
@@ -53,20 +100,16 @@ class Picture:
             cv2.absdiff(self.lab, other.lab).astype(np.float32), np.ones((1, 3))))
 
 
-def weighed(image: np.ndarray) -> np.ndarray:
-    """Return the colours (..., 3) uint8 of an rgb picture as Picture.lab has them."""
-    return np.asarray(cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), _WEIGHED))
-
-
 class Palette:
     """
     A few colours, and how far any colour is from the nearest of them.
 
     :param colours: (N, 3) of Picture.lab, at least one.
+    :param metric: Metric of these.
     :param least: share of the colours near one of them without which it is left out.
     """
 
-    def __init__(self, colours: np.ndarray, least: float = 0.0) -> None:
+    def __init__(self, colours: np.ndarray, metric: Metric = COLOUR, least: float = 0.0) -> None:
         centres = np.ascontiguousarray(colours, np.float32)
         if len(centres) > FEW:
             cv2.setRNGSeed(0)
@@ -75,9 +118,26 @@ class Palette:
                 cv2.KMEANS_PP_CENTERS)
             shares = np.bincount(np.ravel(labels), minlength=FEW) / len(labels)
             centres = np.asarray(found)[shares >= min(least, shares.max())]
-        self._table = np.min([sum(np.abs(axis - value) for axis, value in zip(_AXES, centre))
-                              for centre in centres], 0).ravel()
+        far = [sum(np.abs(axis - value) for axis, value in zip(metric.axes, centre)).ravel()
+               for centre in centres]
+        self._table, self._nearest = np.min(far, 0), np.argmin(far, 0).astype(np.uint8)
+        self._near = np.packbits(np.array(far) < NEAR, 0, 'little')[0]
 
     def distance(self, index: np.ndarray) -> np.ndarray:
         """Return the distances of colours by their index, any shape, float32."""
         return self._table.take(index)
+
+    def nearest(self, index: np.ndarray) -> np.ndarray:
+        """Return which of the colours is nearest, 0 to FEW - 1, by the index of another."""
+        return self._nearest.take(index)
+
+    def recurs(self, index: np.ndarray, wanted: np.ndarray) -> float:
+        """
+        Return how alike the shares of each colour are, 0 to 1; shades of one stand for another.
+
+        :param index: of the colours of some points.
+        :param wanted: of others, which of the colours is nearest.
+        """
+        near = self._near.take(index)[..., None] >> np.arange(FEW) & 1
+        shares = np.bincount(wanted, minlength=FEW) / max(len(wanted), 1)
+        return float(np.minimum(near.reshape(-1, FEW).sum(0) / max(index.size, 1), shares).sum())

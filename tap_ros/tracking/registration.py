@@ -99,14 +99,14 @@ def register(first: Picture, picture: Picture, plane: Plane,
     :param first: the picture of the templates.
     :return: Tracked, LOST what fits nowhere well enough.
     """
-    matcher = Matcher(picture, plane)
     changed = (first.apart(picture) > CHANGED).astype(np.float32)
     region = KEPT + cv2.GaussianBlur(changed, (0, 0), 4)
+    matchers = {one.metric: Matcher(picture.by(one.metric), plane) for one in objects}
     found: dict[int, Pose] = {}
     for _ in objects:
         avoid = [pose.place for pose in found.values()]
         tried = {k: pose for k, one in enumerate(objects) if k not in found and (
-            pose := locate(matcher, one, avoid, region, [one.place])) is not None}
+            pose := locate(matchers[one.metric], one, avoid, region, [one.place])) is not None}
         if not tried:
             break
         best = min(tried, key=lambda k: tried[k].cost)
@@ -149,7 +149,7 @@ def propose(start: View, goal: View) -> np.ndarray:
                        for picture in (before, after))
         if here <= there:  # something came there
             continue
-        mask, _ = silhouette(before, centres[i])
+        mask = silhouette(before, centres[i]).mask
         if mask.any() and not any(np.hypot(*(centre(mask) - other)) < 8 for _, other in found):
             found.append((int(mask.sum()), centre(mask)))
     found.sort(key=lambda one: -one[0])

@@ -19,7 +19,15 @@ from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.registration import locate, mean_shift, register
-from tap_ros.tracking.silhouette import centre, clicked, RADIUS, silhouette, top_face
+from tap_ros.tracking.silhouette import (
+    apart,
+    centre,
+    clicked,
+    OFF,
+    RADII,
+    silhouette,
+    top_face,
+)
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
@@ -29,8 +37,11 @@ HAND_HALF = 0.02  # m, half as wide as the fingers are
 GOOD, GOOD_COST = 0.7, 0.35  # fit of what is believed; cost up to which no other is tried
 MOST_COST = 0.4  # of what is found far from where it was
 NEW_COST, NEW_ANGLE, NEW_SEEN = 0.25, 0.35, 0.85  # from when on the object is cut out anew
+SHARED = 0.8  # of the part of an object that was known, in what is all of it
+UNSURELY = 0.8  # factor of the confidence in an object whose middle is not known
 WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
+RECURS = 0.6  # share of the colours of the first template in such a cut
 KEYS = 6  # templates of an object, the first among them
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
 MOST = (0.5, 1.8)  # of its area, that has to be there then
@@ -53,6 +64,8 @@ class _Object:
     shown: Template = field(init=False)  # that it was seen by last
     around: 'tuple[tuple[slice, slice], Picture] | None' = None  # window of it in which picture
     waits: int = 0  # pictures until it may be cut out anew
+    sure: bool = True  # its middle is known, not only a click near it
+    part: bool = False  # the robot hid a part of it so far
 
     def __post_init__(self) -> None:
         self.shown = self.keys[0]
@@ -71,32 +84,48 @@ class RigidTracker:
         self._objects: list[_Object] = []
         self._gripper: np.ndarray | None = None
 
-    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray) -> Tracked:
-        """Follow other objects; see Tracker."""
+    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray,
+               drawn: Sequence[np.ndarray] = ()) -> Tracked:
+        """
+        Follow other objects, from this picture on.
+
+        :param pixels: (K, 2) (u, v), a click on each object.
+        :param drawn: see Tracker.
+        :raises TrackingError: for a click outside the picture, on the robot, beyond the table, or
+            on nothing that differs from it; then those before are followed on.
+        """
         plane = Plane(self._camera, view.image.shape[:2])
         picture = Picture(view, plane)
         clicks = plane.shrink(np.reshape(pixels, (-1, 2)))
+        names = [f'click {tuple(round(float(x), 1) for x in pixel)}'
+                 for pixel in plane.enlarge(clicks)]
+        cuts = apart([clicked(
+            picture, click, np.delete(clicks, k, 0), names[k],
+            plane.shrink(drawn[k]) if len(drawn) and len(drawn[k]) else None)
+            for k, click in enumerate(clicks)])
         objects = []
-        for k, click in enumerate(clicks):
-            name = 'click ' + str(tuple(round(float(x), 1) for x in plane.enlarge(click)))
-            mask = clicked(picture, click, np.delete(clicks, k, 0), name)
-            face = top_face(mask, plane)
-            place = plane.of_top(centre(face)) if self._snap else plane.of_middle(click)
+        for click, cut, name in zip(clicks, cuts, names):
+            shown, mask, face = picture.by(cut.metric), cut.mask, top_face(cut.mask, plane)
+            off = cut.off(click)
+            sure = cut.whole and not cut.touched and off < OFF
+            # Of half an object, or two witnesses that contradict each other: half way.
+            share = 0.0 if not self._snap or off > 2 * OFF else 1.0 if sure else 0.5
+            place = (1 - share) * plane.of_middle(click) + share * plane.of_top(centre(face))
             if plane.calibrated and not (np.abs(place) < EDGE).all():
                 raise TrackingError(f'{name} is on nothing within {EDGE:g} m of the middle of the '
                                     'table, along x and y; click on an object')
             objects.append(_Object(
-                place, [Template(picture, plane, mask, place)],
-                Template(picture, plane, mask, place, face=face)))
+                place, [Template(shown, plane, mask, place)],
+                Template(shown, plane, mask, place, face=face), sure=sure, part=not cut.whole))
         self._objects, self._plane, self._first = objects, plane, picture
         self._gripper = view.gripper
         return self._tracked()
 
     def update(self, view: View) -> Tracked:
-        """Follow into the next picture; see Tracker."""
+        """Follow into the next picture; return where the K objects are in it."""
         if not self._objects:
             return self._tracked()
-        picture = Picture(view, self._plane)
+        picture = Picture(view, self._plane, self._first)
         hand = None if view.gripper is None or self._gripper is None else (
             np.stack([self._gripper, view.gripper])[:, :3])
         self._gripper = view.gripper
@@ -105,13 +134,14 @@ class RigidTracker:
         return self._tracked()
 
     def find(self, view: View) -> Tracked:
-        """Find the objects in another picture; see Tracker."""
-        return register(self._first, Picture(view, self._plane), self._plane,
+        """Find the objects in another picture; what is not found is LOST, and followed on."""
+        return register(self._first, Picture(view, self._plane, self._first), self._plane,
                         [one.face for one in self._objects])
 
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
-        if one.state == SEEN and one.around is not None and _still(*one.around, picture):
+        picture = picture.by(one.face.metric)
+        if one.age == 0 and one.around is not None and _still(*one.around, picture):
             return
         one.around, one.waits = None, one.waits - 1
         if one.age and hand is not None:
@@ -121,11 +151,12 @@ class RigidTracker:
         pose = self._search(one, keys, matcher, hand)
         if pose is not None and pose.fit > GOOD:
             one.place, one.angle, one.shown = pose.place, pose.angle, pose.template
-            one.age, one.state, one.confidence = 0, SEEN, pose.confidence
+            one.age, one.confidence = 0, pose.confidence
+            one.state = (SEEN if pose.sure else HIDDEN if pose.seen < 0.5 else UNSURE)
             nearest = min(abs(_turned(other.angle - one.angle)) for other in one.keys)
             one.around = self._window(one), picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
-                    pose.cost > NEW_COST or nearest > NEW_ANGLE):
+                    one.part or pose.cost > NEW_COST or nearest > NEW_ANGLE):
                 self._cut_anew(one, picture)
             return
         seen = matcher.score(keys[0], one.place[None], np.array([one.angle - keys[0].angle]))[1][0]
@@ -189,17 +220,37 @@ class RigidTracker:
             right + BESIDE, 0)]
 
     def _cut_anew(self, one: _Object, picture: Picture) -> None:
-        """Add a template of the object as it is now: it has turned, and shows other sides."""
+        """
+        Add a template of the object as it is now: it has turned, and shows other sides.
+
+        That of an object of which a part was seen so far is of all of it, and corrects its place.
+        """
         at, *others = self._plane.middle_pixels([one.place, *(
             other.place for other in self._objects if other is not one)])
         one.waits = WAITS
-        far = np.linalg.norm(self._outline(one) - at, axis=1).max()
-        radius = min(float(far) * 1.4 + 4, RADIUS)
-        mask, _ = silhouette(picture, at, others, radius)
-        beside = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-        if 0.6 < mask.sum() / one.keys[0].area < 1.6 and not (beside & picture.hidden).any():
-            key = Template(picture, self._plane, mask, one.place, one.angle)
-            one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
+        outline = self._outline(one)
+        before = cv2.fillPoly(np.zeros(picture.size, np.uint8), [np.rint(outline).astype(int)], 1)
+        if _reaches(before, picture.hidden):
+            return
+        radius = min(float(np.linalg.norm(outline - at, axis=1).max()) * 1.4 + 4, RADII[1])
+        cut = silhouette(picture, at, others, 0.0 if one.part else radius)
+        mask = cut.mask
+        if _reaches(mask.astype(np.uint8), picture.hidden):
+            return
+        if not one.part:
+            if 0.6 < mask.sum() / one.keys[0].area < 1.6 and one.keys[0].palette.recurs(
+                    picture.index[mask], one.keys[0].kinds) > RECURS:
+                key = Template(picture, self._plane, mask, one.place, one.angle)
+                one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
+            return
+        if cut.whole and not cut.touched and cut.off(at) < OFF and (
+                before[mask].sum() > SHARED * before.sum()):
+            face, one.part, one.sure = top_face(mask, self._plane), False, True
+            if self._snap:
+                one.place = self._plane.of_top(centre(face))
+            one.shown = Template(picture, self._plane, mask, one.place, one.angle)
+            one.keys = [one.shown]
+            one.face = Template(picture, self._plane, mask, one.place, one.angle, face)
 
     def _tracked(self) -> Tracked:
         """Return where the objects are."""
@@ -207,7 +258,7 @@ class RigidTracker:
         return Tracked(
             self._plane.enlarge(self._plane.middle_pixels(places)) if self._objects else places,
             tuple(one.state for one in self._objects),
-            np.array([one.confidence for one in self._objects]),
+            np.array([one.confidence * (1.0 if one.sure else UNSURELY) for one in self._objects]),
             tuple(self._plane.enlarge(self._outline(one)) for one in self._objects))
 
     def _outline(self, one: _Object) -> np.ndarray:
@@ -219,6 +270,11 @@ def _still(window: tuple[slice, slice], before: Picture, now: Picture) -> bool:
         return False
     apart = cv2.absdiff(before.lab[window], now.lab[window])
     return bool((np.asarray(apart) > SAME).mean() < 0.003)
+
+
+def _reaches(mask: np.ndarray, hidden: np.ndarray) -> bool:
+    """Tell whether the robot hides anything next to a mask, both (h, w)."""
+    return bool((cv2.dilate(mask, np.ones((7, 7), np.uint8)) > 0)[hidden].any())
 
 
 def _pushed(one: _Object, hand: np.ndarray) -> np.ndarray:

@@ -3,39 +3,82 @@
 """From a click to the silhouette of an object."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from tap_ros.base.errors import TrackingError
-from tap_ros.tracking.picture import Palette, Picture, weighed
+from tap_ros.tracking.picture import COLOUR, LIGHT, Metric, Palette, Picture
 from tap_ros.tracking.plane import Plane
 
-RADIUS = 36  # working pixels from a click to where no object reaches
+RADII = 36, 64  # working pixels from a click to where no object reaches; a large one
 CORE = 3.5  # px around a click that are the object
 COMMON = 0.12  # share of the ring around that a colour of the table has at least
 SHADES = (1.0, 0.5)  # of the table's light, in shadows of objects
+LIGHTEST = 97  # percentile of the table's lightness: beyond is no table, nor a shadow
 LIKELY, POSSIBLE, SURE = 12.0, 6.0, 25.0  # from the table's colours, of what may be the object
+ALIKE = 14.0  # from the colours under the click, of what is the object where others touch it
 FLAT = 0.3  # share of a silhouette that is its top at least, else the object is not upright
-LEAST_AREA = 64  # px; more than CORE, which is taken for the object whatever it shows
+LEAST_AREA = 48  # px; more than CORE, which is taken for the object whatever it shows
 LEAST_CONTRAST = 7.0  # of the object's colours and the table's, for a click to be believed
+COLOURFUL = 12.0  # contrast of colour without which lightness tells an object, too
 SPREAD = 1.5  # by which it exceeds what colours of the ring differ from the table's, median
-_RINGS = (0.75, 1.3)  # of RADIUS, between which the table is seen
+OFF, NEARER, CLEARER = 9.0, 3.0, 1.5  # px from a click to the middle that is doubted, by which
+# another cut is better, and the factor of its contrast
+TOUCHING = 0.15  # share of an outline at the robot, without which it is all of the object
+SHARED = 0.1  # share of a cut in another one
+ENDS = 0.04  # the same at the end of the search, which is to be widened
+_RINGS = (0.75, 1.3)  # of the radius, between which the table is seen
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What was cut out of a picture."""
+
+    mask: np.ndarray  # (h, w) bool, all False where nothing differs
+    contrast: float  # how its colours differ from those around, median; 0: as those themselves
+    metric: Metric  # by which they do
+    whole: bool  # its outline borders neither the robot nor the end of the search
+    touched: bool = False  # only what has colours as under the click: others touch it
+
+    def off(self, at: np.ndarray) -> float:
+        """Return the distance of its middle from a pixel, inf where nothing was cut out."""
+        return float(np.linalg.norm(centre(self.mask) - at)) if self.mask.any() else np.inf
 
 
 def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.ndarray = (),
-               radius: float = RADIUS) -> tuple[np.ndarray, float]:
+               radius: float = 0.0) -> Cut:
     """
-    Cut out the object around a pixel by GrabCut.
-
-    It begins with colours that are not those of the ring around.
+    Cut out the object around a pixel.
 
     :param at: (2,) (u, v) in the working picture.
     :param others: pixels of other objects.
-    :return: (h, w) bool, all False where nothing differs; and how its colours differ from those
-        around it, median; 0 where those differ as much among themselves.
+    :param radius: px, up to which it is searched; 0: as far as it reaches, see RADII.
     """
-    h, w = picture.size
-    u, v = at
+    if radius:
+        return _cut(picture, at, others, radius)
+    near, far = RADII
+    cut = _cut(picture, at, others, near)
+    if not cut.contrast or _share(cut.mask, _beyond(picture, at, near - 2)) > ENDS:
+        large = _cut(picture, at, others, far)
+        if large.contrast and not _share(large.mask, _beyond(picture, at, far - 2)) > ENDS:
+            cut = large
+    if cut.off(at) > NEARER:  # another one may touch it
+        alone = _cut(picture, at, others, near, alone=True)
+        if alone.off(at) < cut.off(at) - NEARER and (
+                cut.contrast < SURE and alone.contrast > CLEARER * cut.contrast):
+            cut = replace(alone, touched=True)
+    return cut
+
+
+def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.ndarray,
+         radius: float, alone: bool = False) -> Cut:
+    """
+    Cut out by GrabCut, which begins with colours that are not those of the ring around.
+
+    :param alone: only what has colours as under the pixel.
+    """
+    picture, (h, w), (u, v) = picture.by(COLOUR), picture.size, at
     x0, x1 = (int(np.clip(u + side * 1.5 * radius, 0, w)) for side in (-1, 1))
     y0, y1 = (int(np.clip(v + side * 1.5 * radius, 0, h)) for side in (-1, 1))
     window = np.s_[y0:y1, x0:x1]
@@ -49,27 +92,38 @@ def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | 
         if (ring & clear).sum() > 50:
             ring &= clear
     empty = np.zeros(picture.size, bool)
+    nothing = Cut(empty, 0.0, COLOUR, False)
     if not ring.any():
-        return empty, 0.0
-    table = picture.image[window][ring][:, None]
-    unlike = np.min([Palette(shaded(table, share), least=COMMON).distance(picture.index[window])
-                     for share in SHADES], 0)
+        return nothing
+    image = picture.image[window]
+    hue = np.min([Palette(shaded(image[ring][:, None], share), least=COMMON).distance(
+        picture.index[window]) for share in SHADES], 0)
+    light = picture.by(LIGHT).lab[window][..., 0].astype(np.float32)
+    dark, bright = np.percentile(light[ring], (100 - LIGHTEST, LIGHTEST))
+    unlike = hue + np.maximum(light - bright, 0) + np.maximum(dark * SHADES[-1] - light, 0)
     mask = np.full(far.shape, cv2.GC_BGD, np.uint8)
-    near = far < radius
+    near, core = far < radius, far < CORE
     mask[near] = cv2.GC_PR_BGD
-    mask[near & (unlike > LIKELY)] = cv2.GC_PR_FGD
-    mask[(far < radius / 3) & (unlike > POSSIBLE)] = cv2.GC_PR_FGD
-    mask[far < CORE] = cv2.GC_FGD
-    own = np.logical_and.reduce([near, *(far < gap for gap in apart)])
-    mask[own & (unlike > SURE)] = cv2.GC_FGD
+    likely, possible = near & (unlike > LIKELY), (far < radius / 3) & (unlike > POSSIBLE)
+    sure = np.logical_and.reduce([near, unlike > SURE, *(far < gap for gap in apart)])
+    if alone:
+        shown = picture.by(LIGHT)
+        own = Palette(shown.lab[window][core & ~hidden], LIGHT).distance(
+            shown.index[window]) < ALIKE if (core & ~hidden).any() else core
+        likely, possible, sure = likely & own, possible & own, sure & own
+        mask[(unlike > SURE) & ~own] = cv2.GC_BGD
+    mask[likely | possible] = cv2.GC_PR_FGD
+    _, parts = cv2.connectedComponents((sure | core).astype(np.uint8))
+    mask[sure & np.isin(parts, parts[core])] = cv2.GC_FGD
+    mask[core] = cv2.GC_FGD
     mask[hidden] = cv2.GC_BGD
     for other, gap in zip(others, apart):
         if np.hypot(other[0] - u, other[1] - v) > 2 * CORE:
             mask[gap < CORE] = cv2.GC_BGD
     if not (mask & 1).any():
-        return empty, 0.0
+        return nothing
     cv2.setRNGSeed(0)
-    cv2.grabCut(np.ascontiguousarray(picture.image[window]), mask, (0, 0, 0, 0), np.zeros((1, 65)),
+    cv2.grabCut(np.ascontiguousarray(image), mask, (0, 0, 0, 0), np.zeros((1, 65)),
                 np.zeros((1, 65)), 3, cv2.GC_INIT_WITH_MASK)
     found = cv2.morphologyEx(mask & 1, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels = cv2.connectedComponents(found)
@@ -80,21 +134,41 @@ def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | 
         found = labels == part
     empty[window] = found
     if not empty.any():
-        return empty, 0.0
-    contrast = float(np.median(unlike[found > 0]))
-    return empty, contrast if contrast > SPREAD * np.median(unlike[ring]) else 0.0
+        return nothing
+    contrast, colour = (float(np.median(one[found > 0])) for one in (unlike, hue))
+    believed = contrast > SPREAD * np.median(unlike[ring])
+    return Cut(empty, contrast if believed else 0.0, COLOUR if colour > COLOURFUL else LIGHT,
+               _share(empty, picture.hidden | _beyond(picture, at, radius - 2)) <= TOUCHING)
+
+
+def _beyond(picture: Picture, at: np.ndarray, radius: float) -> np.ndarray:
+    """Return the pixels (h, w) farther from one than a radius, and those at the edge."""
+    h, w = picture.size
+    y, x = np.ogrid[:h, :w]
+    edge = (x < 1) | (y < 1) | (x > w - 2) | (y > h - 2)
+    return np.asarray((np.hypot(x - at[0], y - at[1]) > radius) | edge)
+
+
+def _share(mask: np.ndarray, ends: np.ndarray) -> float:
+    """Return the share of the rim of a mask that is next to other pixels, both (h, w) bool."""
+    rim = (cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~cv2.erode(
+        mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    return float(ends[rim].mean()) if rim.any() else 0.0
 
 
 def shaded(colours: np.ndarray, share: float) -> np.ndarray:
     """Return colours (N, 1, 3) uint8 rgb with a share of their light, (N, 3) as Picture.lab."""
-    return weighed(np.rint(colours * share).astype(np.uint8))[:, 0]
+    lab = cv2.cvtColor(np.rint(colours * share).astype(np.uint8), cv2.COLOR_RGB2LAB)
+    return np.asarray(cv2.LUT(lab, COLOUR.weighed))[:, 0]
 
 
-def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str) -> np.ndarray:
+def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
+            line: np.ndarray | None = None) -> Cut:
     """
     Cut out the object under a click, see silhouette.
 
     :param name: of the click, for the message.
+    :param line: (N, 2) outline of the object, where it is known.
     :raises TrackingError: for a click outside the picture, on the robot, or on nothing.
     """
     h, w = picture.size
@@ -103,11 +177,27 @@ def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str) -> 
     if picture.hidden[round(float(at[1])), round(float(at[0]))]:
         raise TrackingError(f'{name} is on the robot or its shadow; click on an object, or move '
                             'the robot away first')
-    mask, contrast = silhouette(picture, at, others)
-    if mask.sum() < LEAST_AREA or contrast < LEAST_CONTRAST:
+    if line is not None:
+        mask = cv2.fillPoly(np.zeros(picture.size, np.uint8), [
+            np.rint(line).clip(-999, 999).astype(int)], 1) > 0
+        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, _share(mask, picture.hidden) <= TOUCHING)
+    else:
+        cut = silhouette(picture, at, others)
+    if cut.mask.sum() < LEAST_AREA or cut.contrast < LEAST_CONTRAST:
         raise TrackingError(f'{name} is on nothing that differs from the table around it; click '
                             'on an object')
-    return mask
+    return cut
+
+
+def apart(cuts: Sequence[Cut]) -> list[Cut]:
+    """Return cuts without what is in a smaller one, too: objects touch there."""
+    found = list(cuts)
+    for k, cut in enumerate(cuts):
+        smaller = [one.mask for one in cuts if one.mask.sum() < cut.mask.sum()]
+        shared = np.logical_or.reduce(smaller) & cut.mask if smaller else np.False_
+        if shared.sum() > SHARED * cut.mask.sum() and (cut.mask & ~shared).sum() > LEAST_AREA:
+            found[k] = replace(cut, mask=cut.mask & ~shared, touched=True)
+    return found
 
 
 def outline(mask: np.ndarray) -> np.ndarray:

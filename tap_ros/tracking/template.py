@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from tap_ros.tracking.picture import Palette, Picture
+from tap_ros.tracking.picture import NEAR, Palette, Picture
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.silhouette import outline
 
@@ -14,7 +14,9 @@ POINTS, RING = 120, 40  # of a template, inside and around
 FAR = 22.0  # distance of colours that counts as none
 HIDDEN = 0.4  # cost of a point behind the robot: hiding there is no way out
 AROUND = 0.35  # weight of points beside the object that look like it
-OWN, SAME = 0.7, 0.8  # of FAR, below which a point has a colour of the object, or its own
+SAME = 17.6  # distance below which a point has its own colour
+SURE, SHOWN, LOOKS = 0.9, 0.3, 0.5  # of a pose, from which on it is sure
+MERGED = 0.4  # more of the points around have its colours than did: it is not told from those
 LEAST_SEEN = 0.2  # share of an object without which no pose near by is believed
 LEAST_SAME = 0.3  # share of points with their own colour without which nothing fits
 CONTRAST = 8.0  # of object and table, below which the surrounding says nothing
@@ -32,6 +34,7 @@ class Template:
     :param place: (2,) of the object; points are relative to it.
     :param angle: of the object in this picture, relative to the first one, rad.
     :ivar area: px.
+    :ivar metric: Metric of the colours.
     :ivar outline: (N, 2) m around the place.
     """
 
@@ -39,7 +42,8 @@ class Template:
                  angle: float = 0.0, face: np.ndarray | None = None) -> None:
         rng = np.random.default_rng(0)
         self.place, self.angle, self.area = place, angle, int(mask.sum())
-        self.palette = Palette(picture.lab[mask])
+        self.metric = picture.metric
+        self.palette = Palette(picture.lab[mask], self.metric)
         self.outline = plane.of_top(outline(mask)) - place
         part = mask if face is None else face
         if plane.blur:  # pixels at its edge are mixed with the table
@@ -48,6 +52,7 @@ class Template:
         pixels = _draw(part, POINTS, rng)
         self.points = (plane.of_top(pixels) - place).astype(np.float32)
         self.colours = picture.lab[pixels[:, 1], pixels[:, 0]]
+        self.kinds = self.palette.nearest(picture.index[pixels[:, 1], pixels[:, 0]])
         inner, outer = (cv2.dilate(part.astype(np.uint8), _round(side + 4 * plane.blur))
                         for side in (5, 9))
         beside = _draw(outer > inner, RING, rng)
@@ -63,6 +68,7 @@ class Template:
         if self.normals is None and self.contrast <= CONTRAST:
             beside = beside[:0]
         self.ring = (plane.of_top(beside) - place).astype(np.float32)
+        self.beside = float((near < NEAR).mean()) if len(near) else 0.0
 
     def outlined(self, place: np.ndarray, angle: float) -> np.ndarray:
         """Return the outline (N, 2) of the object at a place, turned from the first picture."""
@@ -79,6 +85,7 @@ class Pose:
     cost: float  # 0 to 1.35
     seen: float  # share of the points that the robot does not hide
     fit: float  # share of those that have colours of the object
+    looks: float  # how alike the shares of each colour are
     template: Template
 
     @property
@@ -86,6 +93,11 @@ class Pose:
         """The probability that it is right within 2 px of a picture of 64."""
         value = _BIAS + _FIT * self.fit - _COST * self.cost + _SEEN * self.seen
         return float(1 / (1 + np.exp(-value)))
+
+    @property
+    def sure(self) -> bool:
+        """Whether what is there looks like what was clicked."""
+        return self.confidence > SURE and self.seen > SHOWN and self.looks > LOOKS
 
 
 class Matcher:
@@ -140,17 +152,31 @@ class Matcher:
             cost += AROUND * (beside if free.all() else beside / np.maximum(_mean(free), 1e-3))
         return cost, seen
 
-    def fit(self, template: Template, place: np.ndarray, angle: float) -> float:
-        """Return the share of the points seen that have colours of the object, see Pose."""
+    def fit(self, template: Template, place: np.ndarray, angle: float) -> tuple[float, float]:
+        """
+        Return how well a template fits, see Pose.
+
+        :return: the share of the points seen that have colours of the object; and how alike the
+            shares of each colour are there and in the template, 0 where what is around looks
+            like the object, too.
+        """
         index, inside = self._look(template.points, place[None], np.array([angle]))
         apart, free = self._apart(template, index, inside)
         known = max(int(free.sum()), 1)
-        same = (apart < SAME * FAR) & free
+        same = (apart < SAME) & free
         if same.sum() <= LEAST_SAME * known:
-            return 0.0
+            return 0.0, 0.0
         # other sides show as it turns: any of its colours fits
-        own = self.likeness(template).ravel().take(index) > 1 - OWN
-        return float((same | own & free).sum() / known)
+        own = (self.likeness(template).ravel().take(index) > 1 - NEAR / FAR) & free
+        fit = float((same | own).sum() / known)
+        looks = template.palette.recurs(
+            self.picture.index.ravel().take(index)[free], template.kinds[free.ravel()])
+        if len(template.ring) and template.normals is None:
+            index, _ = self._look(template.ring, place[None], np.array([angle]))
+            like = self.likeness(template).ravel().take(index)
+            if (like > 1 - NEAR / FAR).mean() > template.beside + MERGED:
+                return fit, 0.0
+        return fit, looks
 
     def _apart(self, template: Template, index: np.ndarray, inside: np.ndarray | None,
                thin: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -214,7 +240,7 @@ class Matcher:
             best, turned = places[j], float(angles[i])
             reach, turn = reach * next_reach, turn * next_turn
         return Pose(best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
-                    self.fit(template, best, turned), template)
+                    *self.fit(template, best, turned), template)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:

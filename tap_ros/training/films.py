@@ -28,6 +28,7 @@ def film_together(store: 'EpisodeStore', i: int, beside: Sequence['EpisodeStore'
     if first is None:
         return None
     plain, grey = [first.features[:, :-first.grey]], [first.features[:, -first.grey:]]
+    around = [first.around[:-first.grey]]
     for other in beside:
         j = _seen_by(other, store.seen(i))
         one = None if j is None else film_of(other, j)
@@ -38,6 +39,7 @@ def film_together(store: 'EpisodeStore', i: int, beside: Sequence['EpisodeStore'
         rows = np.abs(first.stamps[:, None] - times).argmin(1)
         plain.append(one.features[rows, :-one.grey])
         grey.append(one.features[rows, -one.grey:])
+        around.append(one.around[:-one.grey])
     episode, seconds = store[i], store.seconds(i)
     for name in signals:
         values = (np.full(len(seconds), np.nan)
@@ -49,7 +51,10 @@ def film_together(store: 'EpisodeStore', i: int, beside: Sequence['EpisodeStore'
         plain.append(np.stack([np.interp(
             first.stamps + first.pace * offset, seconds[known], values[known])
             for offset in AROUND_S], 1))
-    return Film(first.stamps, np.concatenate(plain + grey, 1), sum(one.shape[1] for one in grey))
+        around.append(np.array(AROUND_S))
+    pixels = sum(one.shape[1] for one in grey)
+    return Film(first.stamps, np.concatenate(plain + grey, 1), pixels,
+                np.concatenate([*around, np.zeros(pixels)]))
 
 
 def _seen_by(other: 'EpisodeStore', seen: tuple[int, int]) -> int | None:

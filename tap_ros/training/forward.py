@@ -26,7 +26,6 @@ from tap_ros.training.forward_loss import Cuts, forward_loss, make_windows, Wind
 from tap_ros.training.forward_scores import held_out_scores
 from tap_ros.training.frames import Episodes, FilledStore
 from tap_ros.training.run import Run
-from tap_ros.weights import FORWARD_MODEL
 import torch
 
 AVERAGE_DECAY = 0.995  # of the moving average that is shipped
@@ -66,13 +65,13 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
 
 def take_weights(network: LearnedForwardModel, initial_weights: str) -> None:
     """Take over the weights of another forward model, but for its picture of the arm."""
-    path = FORWARD_MODEL if initial_weights == 'push' else initial_weights
-    others = LearnedForwardModel.load(path, precision='float32').state_dict()
+    others = LearnedForwardModel.load(initial_weights, precision='float32').state_dict()
     del others['sprite']
     try:
         network.load_state_dict(others, strict=False)
     except RuntimeError as error:  # names the shapes
-        raise ConfigError(f'initial_weights: {path} are for another network: {error}') from error
+        raise ConfigError(
+            f'initial_weights: {initial_weights} are for another network: {error}') from error
 
 
 def model_config(config: ForwardTrainingConfig, store: EpisodeStore,

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Union
 
 import numpy as np
 from tap_ros.base.files import storage_errors
+from tap_ros.base.progress import Progress
 from tap_ros.images.robot_mask import fill_in_time, hidden_pixels, last_free, RobotMask
 from tap_ros.recording.cache import cache_folder
 import torch
-from tqdm import tqdm
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
@@ -60,7 +60,7 @@ class ResidentFrames:
         self._goal[goals] = store.num_frames + np.arange(len(goals))
         size = store.num_frames + len(goals)
         self._frames = torch.empty((size, *store.image_size, 3), dtype=torch.uint8, device=device)
-        for i in tqdm(range(len(store)), 'frames to the device', disable=not progress):
+        for i in Progress(range(len(store)), 'frames to the device', disable=not progress):
             frames = torch.from_numpy(np.array(store.frames(i)))
             self._frames[self._first[i]:self._first[i + 1]] = frames
             if self._goal[i] >= 0:
@@ -103,7 +103,8 @@ class FilledStore:
         with storage_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder) as file:
-                for i in tqdm(range(len(store)), 'filling behind the robot', disable=not progress):
+                for i in Progress(
+                        range(len(store)), 'filling behind the robot', disable=not progress):
                     for pictures in self._fill(i):
                         file.write(np.ascontiguousarray(pictures).data)
                 file.flush()

@@ -5,11 +5,14 @@ Labels: the moments that a few marks name, found in every demonstration of a dat
 
 Each named mark gets a softmax over the frames of a demonstration, of a linear function of what the
 pictures show around a frame. The marks of a demonstration are decoded together: they come in their
-order, about as far apart as in the demonstrations that were marked.
+order, about as far apart as in the demonstrations that were marked. Several such models, which see
+more or less around a frame and of its picture, are averaged, each weighed by how likely it makes
+marks that it was not learned from.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 import math
 from typing import TYPE_CHECKING
 
@@ -26,7 +29,11 @@ USUAL_S = 8.0  # of a demonstration; in shorter ones all times below are shorter
 RATE = 10.0  # Hz, at most, of the frames that may be labels
 MOTION_RATE = 5.0  # Hz, about, of the frames between which motion is described
 AROUND_S = (-0.6, -0.3, 0.0, 0.3, 0.6)  # of the frames that are described together
-GREY = (0.0, 0.1, 0.3, 1.0)  # weights of the small grey picture that are tried
+REACH_S = (0.0, 0.3, 0.6)  # how far around a frame models look: of AROUND_S so many
+# Weights that the small grey picture has in models: of pixels in their deviations; and as they
+# are, so that one in which little happens says little.
+GREY, PLAIN_GREY = (0.0, 0.1, 0.3, 1.0), (0.3, 1.0, 2.0)
+LEAST_SHARE = 1e-3  # of a model that counts in the average
 RIDGE = 0.2  # price of the squared weights, in nats; features have variance 1
 SPREAD_S = 0.1  # a mark is off by so much as often as not
 TOLERANCE_S = 0.3  # within which a label is held to be right
@@ -39,14 +46,16 @@ class Film:
     What the pictures of a demonstration show around each of its frames, at RATE at most.
 
     :param stamps: (T,) s.
-    :param features: (T, D) float64: FEATURES at the times AROUND_S, likewise of other cameras, and
+    :param features: (T, D) float64: FEATURES at the times AROUND_S, also of other cameras, and
         signals; then the small grey picture of each camera.
     :param grey: how many of the last columns are those of pictures.
+    :param around: (D,) s, of AROUND_S the one of each column; 0 of the grey pictures.
     """
 
     stamps: np.ndarray
     features: np.ndarray
     grey: int
+    around: np.ndarray
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -117,8 +126,9 @@ def film(frames: np.ndarray, stamps_ns: np.ndarray, hidden: np.ndarray | None = 
     grey = np.empty((len(index), phases[0].shape[1] - len(FEATURES)))
     for k, phase in enumerate(phases):
         grey[k::step] = phase[:, len(FEATURES):]
-    return Film(stamps, np.concatenate([found[near].reshape(len(index), -1), grey], 1),
-                grey.shape[1])
+    return Film(
+        stamps, np.concatenate([found[near].reshape(len(index), -1), grey], 1), grey.shape[1],
+        np.append(np.repeat(AROUND_S, len(FEATURES)), np.zeros(grey.shape[1])))
 
 
 @dataclass(frozen=True)
@@ -146,20 +156,26 @@ class MomentModel:
 
     :param films: that were marked.
     :param moments: of each (M,) s.
-    :param grey: weight of the small grey picture.
+    :param grey: weight of the small grey picture; below 0: of its pixels as they are.
+    :param reach: s around a frame, of AROUND_S, that count.
+    :param like: a model of nearly the same marks, from which the search for weights begins.
     :raises ConfigError: without marks, or where not all have as many.
     """
 
-    def __init__(self, films: Sequence[Film], moments: Sequence[np.ndarray], grey: float) -> None:
+    def __init__(self, films: Sequence[Film], moments: Sequence[np.ndarray], grey: float,
+                 reach: float = AROUND_S[-1], like: 'MomentModel | None' = None) -> None:
         if not films or len({len(one) for one in moments}) != 1 or not len(moments[0]):
             raise ConfigError('marks: expected some demonstrations with the same marks each; mark '
                               'ten')
         everything = np.concatenate([one.features for one in films])
         self._mean, self._scale = everything.mean(0), 1 / np.maximum(everything.std(0), 1e-6)
-        self._scale[-films[0].grey:] *= grey
+        pixels = slice(-films[0].grey, None)
+        self._scale[pixels] = -grey if grey < 0 else grey * self._scale[pixels]
+        self._scale[np.abs(films[0].around) > reach + 1e-6] = 0
         inputs = [self._inputs(one) for one in films]
-        self._weights = np.stack([
-            _most_likely(inputs, [spread(one, second[m]) for one, second in zip(films, moments)])
+        self._weights: np.ndarray = np.stack([
+            _most_likely(inputs, [spread(one, second[m]) for one, second in zip(films, moments)],
+                         None if like is None else like._weights[:, m])
             for m in range(len(moments[0]))], 1)
         gaps = np.diff(np.stack(moments), axis=1)  # (N, M - 1) s
         self._gap = gaps.mean(0)
@@ -189,6 +205,26 @@ class MomentModel:
         return (one.features - self._mean) * self._scale
 
 
+class Average:
+    """
+    The average of several models.
+
+    :param models: MomentModels of the same marks.
+    :param worth: of each, the logarithm of how likely it made marks not seen.
+    """
+
+    def __init__(self, models: Sequence[MomentModel], worth: np.ndarray) -> None:
+        share = np.exp(worth - _log_sum(worth))
+        self._models = [(model, math.log(one)) for model, one in zip(models, share.tolist())
+                        if one >= LEAST_SHARE]
+
+    def log_posterior(self, one: Film) -> np.ndarray:
+        """Return log of the posterior of each mark and frame, (M, T)."""
+        found = _log_sum(np.stack([
+            log_share + model.log_posterior(one) for model, log_share in self._models], -1))
+        return np.asarray(found - _log_sum(found)[:, None])
+
+
 def moments_of(one: Film, log_posterior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the moments (M,) s that are right within TOLERANCE_S most likely, and how likely.
@@ -202,37 +238,31 @@ def moments_of(one: Film, log_posterior: np.ndarray) -> tuple[np.ndarray, np.nda
     return one.stamps[best], mass[np.arange(len(best)), best].clip(0, 1)
 
 
-def leave_one_out(films: Sequence[Film], moments: Sequence[np.ndarray],
-                  grey: float) -> tuple[float, list[np.ndarray]]:
-    """
-    Find the marks of each demonstration by those of the others.
-
-    :return: how likely they are right within TOLERANCE_S, the sum of logarithms; and the moments.
-    """
-    worth, found = 0.0, []
-    for i, (one, marks) in enumerate(zip(films, moments)):
-        posterior = MomentModel([*films[:i], *films[i + 1:]], [*moments[:i], *moments[i + 1:]],
-                                grey).log_posterior(one)
-        near = np.abs(one.stamps - marks[:, None]) <= one.tolerance  # (M, T)
-        worth += float(np.log((np.exp(posterior) * near).sum(1) + 1e-3).sum())
-        found.append(moments_of(one, posterior)[0])
-    return worth, found
-
-
 def fit(films: Sequence[Film],
-        moments: Sequence[np.ndarray]) -> tuple[MomentModel, list[np.ndarray]]:
+        moments: Sequence[np.ndarray]) -> tuple[MomentModel | Average, list[np.ndarray]]:
     """
-    Learn from marks; the grey picture gets the weight by which they find one another best.
+    Learn models from marks, and from all marks but those of each demonstration, to weigh them.
 
     :param films: that were marked; moments: of each (M,) s.
-    :return: the model, and of each what the others make of it, see Labels.left_out.
+    :return: the average, and of each what the others make of it, see Labels.left_out.
     :raises ConfigError: see MomentModel.
     """
     if len(films) < 3:
         return MomentModel(films, moments, GREY[1]), []
-    tried = {grey: leave_one_out(films, moments, grey) for grey in GREY}
-    grey = max(GREY, key=lambda grey: tried[grey][0])
-    return MomentModel(films, moments, grey), tried[grey][1]
+    kinds = list(product((*GREY, *(-one for one in PLAIN_GREY)), REACH_S))
+    models = [MomentModel(films, moments, *kind) for kind in kinds]
+    worth, others = np.empty((len(models), len(films))), list[list[MomentModel]]()
+    for i, (one, marks) in enumerate(zip(films, moments)):
+        rest = [*films[:i], *films[i + 1:]], [*moments[:i], *moments[i + 1:]]
+        others.append([MomentModel(*rest, *kind, like) for kind, like in zip(kinds, models)])
+        near = np.abs(one.stamps - marks[:, None]) <= one.tolerance  # (M, T)
+        for k, model in enumerate(others[-1]):
+            right = (np.exp(model.log_posterior(one)) * near).sum(1)
+            worth[k, i] = np.log(right + 1e-3).sum()
+    total = worth.sum(1)
+    return Average(models, total), [
+        moments_of(one, Average(those, total - worth[:, i]).log_posterior(one))[0]
+        for i, (one, those) in enumerate(zip(films, others))]
 
 
 def label(films: Sequence[Film | None], marked: Mapping[int, np.ndarray],
@@ -278,27 +308,33 @@ def spread(one: Film, second: float) -> np.ndarray:
     return share / share.sum()
 
 
-def _most_likely(inputs: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> np.ndarray:
+def _most_likely(inputs: Sequence[np.ndarray], wanted: Sequence[np.ndarray],
+                 start: np.ndarray | None) -> np.ndarray:
     """
     Return the weights a (D,) of the most likely softmax over frames, with a ridge.
 
     Minimises sum_n -wanted_n . log softmax(x_n a) + RIDGE |a|^2, which is convex.
 
     :param inputs: (T, D) each; wanted: (T,) each, adding up to 1.
+    :param start: (D,), from which to search; None: 0.
     """
     from scipy.optimize import minimize  # takes a moment to import
-    target = sum(p @ x for x, p in zip(inputs, wanted))
+    rows = np.concatenate(inputs)
+    target = np.concatenate(wanted) @ rows
+    firsts = np.cumsum([0, *(len(x) for x in inputs[:-1])])
+    of_film = np.repeat(np.arange(len(inputs)), [len(x) for x in inputs])
 
     def loss(a: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = RIDGE * a @ a - target @ a, 2 * RIDGE * a - target
-        for x in inputs:
-            z = x @ a
-            total = _log_sum(z)
-            value, slope = value + total, slope + np.exp(z - total) @ x
-        return float(value), slope
+        z = rows @ a
+        largest = np.maximum.reduceat(z, firsts)
+        share = np.exp(z - largest[of_film])
+        total = np.add.reduceat(share, firsts)
+        value = (largest + np.log(total)).sum() + (RIDGE * a - target) @ a
+        return float(value), 2 * RIDGE * a - target + (share / total[of_film]) @ rows
 
-    return np.asarray(minimize(loss, np.zeros(inputs[0].shape[1]), jac=True, method='L-BFGS-B',
-                               options={'maxiter': 300}).x)
+    return np.asarray(minimize(
+        loss, np.zeros(rows.shape[1]) if start is None else start, jac=True, method='L-BFGS-B',
+        options={'maxiter': 300}).x)
 
 
 def _log_sum(z: np.ndarray) -> np.ndarray:

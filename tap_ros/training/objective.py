@@ -94,9 +94,10 @@ class Judged:
     What the discriminators learn from.
 
     :param pairs: each discriminator, and the predictions (B, 3, H, W) that it judges.
-    :param context: (B, C, 3, H, W); real: (B, 3, H, W), the matched frames; other: likewise, of
+    :param context: (B, C, 3, H, W); real: (B, 3, H, W), the matched frames; other: the same of
         other times.
-    :param step: int64 (B,), the outputs that the matched frames belong to; other_step: likewise.
+    :param step: int64 (B,), the outputs that the matched frames belong to; other_step: (B,)
+        of the others.
     """
 
     pairs: list[tuple[torch.nn.Module, torch.Tensor]]

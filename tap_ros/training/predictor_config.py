@@ -39,7 +39,7 @@ class TrainingConfig(RunConfig):
     :param loss: 'fix' (Eq. 1), 'min' (Eq. 2) or 'genmin' (Eq. 5).
     :param selection: which error chooses the target of genmin: the 'absolute' one, divided by the
         preference over time, as in the paper; the one 'relative' to copying an input; the
-        absolute one with the preference over the 'progress' that pictures show (losses.py); the
+        absolute one with the preference over the 'progress' that pictures show; the
         relative one with a preference for frames that are 'still'; or the absolute one with
         labels learned from 'marks' as a prior. fix with marks has its target at the label.
     :param marks: JSON file of demonstrations whose bottleneck a person has marked, see `mark`.
@@ -54,7 +54,7 @@ class TrainingConfig(RunConfig):
     :param beta: of the linear preference of genmin in forward prediction; in the paper 2, 4 and 7
         did best.
     :param progress_margin: with selection progress, frames whose progress is within this of that
-        of the start or the goal picture are not matched, see losses.beside_context; 0..0.95.
+        of the start or the goal picture are not matched; 0..0.95.
     :param recursion: levels of Eq. 3; 1: none. The GAN's and the VAE's terms stand at the first.
     :param kl_weight: of the KL divergence beside the l1 error on [0, 1].
     :param free_nats: KL divergence up to this, in the mean over the batch, costs nothing; 0, the

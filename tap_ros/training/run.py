@@ -19,6 +19,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from tap_ros.base.errors import RecordingError
 from tap_ros.base.files import only_writer, storage_errors, write_atomically
+from tap_ros.base.progress import Progress
 from tap_ros.recording.bags import known_bags
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
@@ -38,7 +39,6 @@ from tap_ros.weights.devices import pick_device
 from tap_ros.weights.weights import save_weights
 import torch
 from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 Trained = TypeVar('Trained', bound=torch.nn.Module)
 Item = TypeVar('Item')  # what a step takes
@@ -156,10 +156,10 @@ class Run(Generic[Config]):
         :raises KeyboardInterrupt: after the step in which Ctrl-C was pressed, and all is saved.
         """
         config, state = self.config, self.state
-        interrupted, curves, bar = map(self._stack.enter_context, (
-            _first_interrupt(), SummaryWriter(config.out, purge_step=state.step),
-            tqdm(total=config.steps, initial=state.step, unit='step', disable=not self.progress,
-                 desc=self.kind.replace('_', ' '))))
+        bar: Any = Progress(total=config.steps, initial=state.step, unit='step',
+                            disable=not self.progress, desc=self.kind.replace('_', ' '))
+        interrupted, curves, _ = map(self._stack.enter_context, (
+            _first_interrupt(), SummaryWriter(config.out, purge_step=state.step), bar))
         began = time.monotonic() - state.seconds
 
         def hopeless() -> bool:
@@ -196,8 +196,8 @@ class Run(Generic[Config]):
             if stopped:
                 break
         if interrupted.is_set():
-            tqdm.write(f'{state.step} of {config.steps} steps are saved in {config.out}; the same '
-                       'command goes on from there', sys.stderr)
+            Progress.write(f'{state.step} of {config.steps} steps are saved in {config.out}; the '
+                           'same command goes on from there', sys.stderr)
             raise KeyboardInterrupt
 
     def _report(self, scores: Mapping[str, float], show: Show, curves: SummaryWriter) -> None:

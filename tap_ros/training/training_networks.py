@@ -67,7 +67,7 @@ def discriminator_loss(real: torch.Tensor, generated: torch.Tensor, other: torch
     approximated by one frame, as in section 3.3.
 
     :param real: (B, |T|) logits of D(c, x_t); generated: of D(c, G(c)); other: of D(c, x_t').
-    :param step: int64 (B,), t as an index into |T|; other_step: likewise t'.
+    :param step: int64 (B,), t as an index into |T|; other_step: int64 (B,), t'.
     :return: scalar: the sum of the three cross entropies, as a mean over the batch.
     """
     real, generated, other = (
@@ -127,7 +127,7 @@ def kl_divergence(mean: torch.Tensor, log_variance: torch.Tensor) -> torch.Tenso
 
     D_KL(q_phi(z | X), p(z)) = 1/2 sum (mu^2 + sigma^2 - 1 - log sigma^2).
 
-    :param mean: (B, latent_size); log_variance: likewise.
+    :param mean: (B, latent_size); log_variance: (B, latent_size).
     :return: (B,), in nats, the sum over the dimensions of z.
     """
     return (mean ** 2 + log_variance.exp() - 1 - log_variance).sum(1) / 2

@@ -5,11 +5,14 @@
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+import subprocess
 import sys
 
 import pytest
+import tap_ros
 from tap_ros.__main__ import LINE, main
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.split import split_episodes
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +29,42 @@ def test_an_error_names_the_file_and_is_one_line(arguments, named, capsys, tmp_p
     assert main(arguments) == 1
     error = capsys.readouterr().err.strip()
     assert error.startswith('error: ') and named in error and '\n' not in error
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    assert main(['--version']) == 0
+    assert capsys.readouterr().out == f'tap_ros {tap_ros.__version__}\n'
+    manifest = (ROOT / 'package.xml').read_text()
+    assert f'<version>{tap_ros.__version__}</version>' in manifest
+
+
+@pytest.mark.parametrize('words, near, others', [
+    (['trian', 'x'], 'train', 'import-lerobot'), (['train', 'predicter', 'x'], 'predictor', ''),
+    (['evaluate', 'predction'], 'prediction', 'forward'), (['inspct', '--help'], 'inspect', '')])
+def test_an_unknown_command_is_answered_with_the_nearest_one(words, near, others, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and f"did you mean '{near}'" in said and others in said
+    assert said.count('\n') == 1
+
+
+def test_a_progress_bar_in_a_pipe_is_one_line(tmp_path):
+    words = ['collect', '--out', 'bag', '--episodes', '3', '--task', 'grasp',
+             '--episodes-per-file', '1']
+    run = subprocess.run([sys.executable, '-m', 'tap_ros', *words], cwd=tmp_path, text=True,
+                         capture_output=True, check=True)
+    line, = run.stderr.splitlines()
+    assert '3/3' in line and '\r' not in run.stderr
+
+
+def test_inspect_holds_out_what_a_training_does(capsys):
+    for share, said in (('0.05', '19 episodes to learn from, 1 held out'),
+                        ('0.25', '15 episodes to learn from, 5 held out')):
+        assert main(['inspect', str(SAMPLE), '--test-fraction', share]) == 0
+        assert said in capsys.readouterr().out
+        training, held_out = split_episodes(open_recordings(SAMPLE), float(share))
+        assert said.startswith(f'{len(training)} ') and f' {len(held_out)} held out' in said
 
 
 def test_collect_then_inspect(tmp_path, capsys):

@@ -93,6 +93,8 @@ def needed(kind, text):
 def test_help_says_of_every_option_what_it_is_and_takes(command, capsys, monkeypatch):
     text = help_of(command, capsys, monkeypatch)
     assert text.startswith(f'usage: python -m {command}')
+    assert not re.findall(  # code in the place of choices
+        r'likewise|\w+\.py\b|see [a-z_]+\.\w+|see \w+_node', text)
     line = command + needed(kinds()[command], text)
     before, given = given_in(line), []
     for name, default in options(kinds()[command]):

@@ -5,6 +5,7 @@
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 import json
+from pathlib import Path
 import shlex
 import socket
 import threading
@@ -12,6 +13,7 @@ import time
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+from browsing import chromium, hidden_or_over, needs_browser, opened
 import cv2
 from made_episodes import move_squares, write_bag
 import numpy as np
@@ -222,8 +224,15 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
     assert label == ['python', '-m', 'tap_ros', 'label', str(bag), '--marks', 'my marks.json',
                      '--out', 'labels/squares']
     assert train[3:] == ['train', 'predictor', str(bag), '--marks', 'my marks.json', '--rate',
-                         '4', '--crop', 'whole', '--size', '64', '--recursion', '2', '--out',
-                         'runs/squares']
+                         '4', '--crop', 'centre', '--size', '64', '--recursion', '2',
+                         '--test-fraction', '0.25', '--threads', '1', '--out', 'runs/squares']
+    one = Marking(store, [str(bag)], tmp_path / 'one.json', ['grasp'])
+    for i in range(2):
+        one.mark(i, [3])
+    page = (Path(__file__).parents[2] / 'docs/first_hour.md').read_text()
+    words = one.commands(['--crop', 'centre'])[1].replace(str(bag), 'bags/bottle').replace(
+        'one.json', 'bags/bottle.marks.json').replace('runs/squares', 'runs/bottle')
+    assert f'\n{words}\n' in page, 'the page of the first hour has this command'
     asked = parse(Options, label[4:])
     assert asked.recordings == (str(bag),) and asked.marks == 'my marks.json'
 
@@ -255,3 +264,37 @@ def test_a_second_server_of_a_file_is_refused(bag, tmp_path, capsys):
         assert main(['mark', str(bag), '--marks', str(path), '--port', '0']) == 1
     assert capsys.readouterr().err.splitlines() == [
         f'error: {path}: another process keeps it; end that one, or choose another file']
+
+
+@needs_browser
+@pytest.mark.slow
+def test_what_marks_is_in_sight_at_a_desk_and_on_a_phone_and_keys_press_what_they_are_on(
+        bag, store, tmp_path):
+    path = tmp_path / 'marks.json'
+    marking = Marking(store, [str(bag)], path, ['grasp', 'release'])
+    with serving(marking) as ask, chromium() as browser:
+        for i, (size, scheme) in enumerate((((1280, 800), 'light'), ((390, 844), 'dark'))):
+            with opened(browser, ask('').url, size, color_scheme=scheme) as page:
+                page.wait_for_function("about && document.getElementById('now').naturalWidth")
+                page.wait_for_function("document.getElementById('goal').naturalWidth")
+                assert not hidden_or_over(
+                    page, 'header', '#title', '#shown', '#time', '#names', '#accept', '#next')
+                before = page.locator('#names button').first.bounding_box()
+                page.keyboard.press('1')
+                assert 'release not yet' in page.inner_text('#title') and marking.state()[
+                    'marks'].keys() == {*range(i)}
+                assert page.locator('#names button').first.bounding_box() == before
+                page.focus('#accept')  # somebody came there by Tab
+                page.keyboard.press('Enter')
+                page.wait_for_function(f'Object.keys(state.marks).length === {i + 1}')
+                ticks = page.evaluate("""() => [...document.querySelectorAll('#ticks button')]
+                    .filter((one) => one.textContent).map((one) => {
+                        const {left, right, top} = one.getBoundingClientRect();
+                        return [top, left, right];
+                    }).sort((a, b) => a[0] - b[0] || a[1] - b[1])""")
+                assert len(ticks) > 2 and all(
+                    top != other or right <= left
+                    for (top, _, right), (other, left, _) in zip(ticks, ticks[1:]))
+                shown = page.evaluate('episode')
+                page.click('#next')
+                page.wait_for_function(f'episode !== {shown}')

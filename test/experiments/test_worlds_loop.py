@@ -5,26 +5,41 @@
 from dataclasses import replace
 import json
 
-from experiments.worlds import loop
-from experiments.worlds.pushes import GoalPushes, RandomPushes
+from experiments.worlds import judged, loop
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
+from tap_ros.base.errors import ConfigError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 
 
-def test_marked_is_where_the_object_has_not_yet_moved_in_what_succeeds(tmp_path):
-    still = [[4, 4]] * 6 + [[10, 4]] * 3
+def write_moves(tmp_path, places, outcomes, metres=None):
     made = []
-    for i, outcome in enumerate(('success', 'failure')):
-        episode = move_squares(still[:2], still[:2], seed=i, outcome=outcome)
-        pixels = np.stack([still, still], axis=1).astype(np.float32)
-        made.append(replace(episode, object_pixels=pixels))
-    bag = write_bag(tmp_path / 'bag', made)
+    for i, outcome in enumerate(outcomes):
+        episode = move_squares(places[:2], places[:2], seed=i, outcome=outcome)
+        pixels = np.stack([places, places], axis=1).astype(np.float32)
+        poses = episode.object_poses
+        if metres is not None:
+            poses = np.zeros((len(places), 2, 7))
+            poses[..., :2] = np.array(metres)[:, None]
+        made.append(replace(episode, object_pixels=pixels, object_poses=poses))
+    return write_bag(tmp_path / 'bag', made)
+
+
+def test_marked_is_where_the_object_has_not_yet_moved_in_what_succeeds(tmp_path):
+    bag = write_moves(tmp_path, [[4, 4]] * 6 + [[10, 4]] * 3, ('success', 'failure'))
     (marked, ((first, last),)), = read_marks(
         loop.mark(bag), open_recordings([bag])).episodes.items()
     assert marked == 0 and first == last and abs(first - 5) <= 1
+
+
+def test_marked_is_where_the_object_comes_to_rest_by_the_way(tmp_path):
+    metres = [[0, 0], [0.05, 0], *[[0.12, 0]] * 3, [0.12, -0.1], *[[0.12, -0.2]] * 3]
+    bag = write_moves(tmp_path, [[4, 4]] * 9, ('success',), metres)
+    (marks,) = read_marks(loop.mark(bag, ((0.13, 0), (0.12, -0.21))),
+                          open_recordings([bag])).episodes.values()
+    assert [first for first, _ in marks] in ([a, b] for a in (2, 3) for b in (6, 7))
 
 
 def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
@@ -35,34 +50,38 @@ def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
         ran.append((task, method, seed))
         return seed % 2 and {
             'task': task, 'method': method, 'seed': seed, 'ends': method != 'random',
-            'ever': True, 'steps': 7, 'goal_cm': 1.0, 'start_cm': 20.0, 'final_cm': 2.5}
+            'ever': True, 'steps': 7, 'goal_cm': 1.0, 'start_cm': 20.0, 'final_cm': 2.5} or None
 
     monkeypatch.setattr(loop, 'run_scene', run_scene)
-    (tmp_path / 'push-v3').mkdir()
-    args = loop.Options(tasks=('push-v3',), scenes=2, methods=('random', 'direct'),
-                        runs=str(tmp_path), out=str(tmp_path))
-    weights = dict.fromkeys(('forward', 'push-v3'), '')
-    loop.run_scenes(args, weights)
-    assert {seed - loop.FIRST_SCENE for _, _, seed in ran} == {0, 1, 2, 3} and len(ran) == 8
-    loop.run_scenes(args, weights)
-    assert len(ran) == 8
-    loop.write_results(tmp_path, tmp_path, args)
+    monkeypatch.setattr(loop, 'make_weights', lambda args, task, seed: {
+        'subgoal': judged.Weights(predictor=str(seed))})
+    args = loop.Options(
+        tasks=('push-v3',), scenes=2, methods=('random', 'straight', 'around', 'subgoal'),
+        seeds=2, runs=str(tmp_path), out=str(tmp_path))
+    loop.run(args)
+    assert {seed - loop.FIRST_SCENE for _, _, seed in ran} == {0, 1, 2, 3}
+    # Nothing is in the way of push-v3; a scene without a goal is tried once; two trainings.
+    assert len(ran) == 2 + 2 * 2 + 2 * 2
+    loop.run(args)
+    assert len(ran) == 10
     rows = json.loads((tmp_path / 'worlds_loop.json').read_text())
-    assert [row['seed'] - loop.FIRST_SCENE for row in rows] == [1, 1, 3, 3]
+    assert [row['seed'] - loop.FIRST_SCENE for row in rows] == [1] * 4 + [3] * 4
+    assert [row['training'] for row in rows] == [0, 0, 0, 1] * 2
     page = (tmp_path / 'worlds_loop.md').read_text()
-    assert '| push-v3 | random | 2 | 0% (0 to 66)' in page and '| direct | 2 | 100%' in page
+    assert '| push-v3 | random | 2 |' in page and '0% (0 to 66)' in page
+    assert '| push-v3 | subgoal | 2 | 2 | 100%' in page
+    with pytest.raises(ConfigError, match='dircet unknown'):
+        loop.run(replace(args, methods=('dircet',)))
 
 
-def test_pushes_are_recorded_as_a_planner_and_its_model_need_them():
+def test_places_that_are_put_by_hand_are_subgoals_there():
     pytest.importorskip('metaworld')
-    worlds = GoalPushes('plate-slide-v3', 32), RandomPushes('push-v3', 32)
-    pushed, about = (world.demonstrate(3).episode for world in worlds)
-    for world in worlds:
-        world.close()
-    assert (pushed.task, pushed.outcome) == ('plate-slide-v3', 'success')
-    for episode in (pushed, about):
-        assert episode.object_source == 'ground_truth' and episode.robot_masks.any()
-        moved = episode.grippers[1:, :3] - episode.grippers[:-1, :3]
-        assert np.median(np.abs(moved - episode.actions[:-1, :3])) < 0.01, 'as it was told'
-    way = np.linalg.norm(pushed.object_poses[:, 0] - pushed.object_poses[0, 0], axis=1)
-    assert way[:4].max() < 0.01 and way[-1] > 0.1
+    world = judged.Judged('push-wall-v3', 64)
+    start = world.reset(loop.FIRST_SCENE)
+    first, second = judged.Places(world).predict(
+        start.image, world.goal().image, start.object_pixels, world.goal().object_pixels,
+        recursion_depth=2)
+    np.testing.assert_allclose(
+        first.expected_pixels, world.camera.project([[0.12, 0, 0.02]]), atol=0.01)
+    assert second.expected_pixels[0, 1] > first.expected_pixels[0, 1] + 10, 'nearer to the camera'
+    world.close()

@@ -125,7 +125,8 @@ def test_a_browser_that_answers_nothing_or_takes_nothing_is_let_go(monkeypatch):
 
 def test_foreign_pages_and_foreign_names_that_lead_here_are_refused():
     with serving() as server:
-        for path, words in (('/', b'<canvas id="goal"'), ('/explorer.js', b'WebSocket')):
+        for path, words in (('/', b'<canvas id="large"'), ('/explorer.js', b'WebSocket'),
+                            ('/shared.js', b'getElementById')):
             status, headers, body = get(server, path)
             assert status == 200 and words in body
             assert "script-src 'self'" in headers['Content-Security-Policy']

@@ -63,6 +63,10 @@ def test_all_ways_the_targets_and_the_gripper_are_where_they_belong():
         assert shown(canvas, target) == OBJECT_COLOURS[k]
     touched = (canvas != 90).any(-1).mean()
     assert 0.01 < touched < 0.1, 'most of the picture stays as it is'
+    camera = np.random.default_rng(0).integers(80, 100, (256, 256, 3), np.uint8)
+    sharp = plan_view.draw_plan(GREY, ABOVE, plan_of(*ways), HAND, TARGETS, camera)
+    assert sharp.shape == canvas.shape and shown(sharp, middle[0]) == plan_view.CHOSEN
+    assert ((np.abs(sharp.astype(int) - canvas) > 20).any(-1)).mean() < 0.02 < sharp[:9].std()
     wide = plan_view.draw_plan(
         np.zeros((160, 320, 3), np.uint8), ABOVE, plan_of(*ways), HAND, TARGETS)
     assert wide.shape[1] == plan_view.LARGEST

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """predict_subgoal and the states of its node, asked over DDS, with small untrained networks."""
 
+import threading
+
 import cv2
 from lifecycle_msgs.msg import State, Transition
 from lively import lively_network
@@ -12,6 +14,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.__main__ import main
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.predictor import requests
@@ -20,6 +23,7 @@ from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.retrieval import ends_of
 from tap_ros.ros.calls import call
+from tap_ros.ros.requests import NOTHING_CAME
 from tap_ros.ros.topics import encode_image, encode_objects, LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights.weights import save_weights, stored_digest
 
@@ -214,6 +218,29 @@ def test_a_request_right_after_the_start_waits_until_a_camera_is_found(
             images = eye.create_publisher(Image, '/early/camera/image_raw', STREAM)
             assert until(lambda: images.publish(START) or answer.done(), 60)
         assert answer.result().success, answer.result().message
+    finally:
+        assert service.end() == 0
+
+
+def test_the_command_waits_for_the_first_picture_as_long_as_its_timeout(
+        client, files, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(requests, 'DISCOVERY_S', 0.0)
+    service = Service(client, 'dark', weights=files['plain'])
+    cv2.imwrite(str(tmp_path / 'goal.png'), PICTURES[1])
+    words = ['call', '--namespace', '/dark', '--goal', str(tmp_path / 'goal.png'),
+             '--out', str(tmp_path / 'answer.png'), '--timeout']
+    codes = []
+    try:
+        assert main([*words, '6']) == 1
+        assert NOTHING_CAME in capsys.readouterr().err
+        asking = threading.Thread(target=lambda: codes.append(main([*words, '60'])))
+        asking.start()
+        assert not until(lambda: codes, 2.0)
+        with Client('dark_eye') as eye:
+            images = eye.create_publisher(Image, '/dark/camera/image_raw', STREAM)
+            assert until(lambda: images.publish(START) or codes, 60)
+        asking.join()
+        assert codes == [0] and (tmp_path / 'answer.png').exists()
     finally:
         assert service.end() == 0
 

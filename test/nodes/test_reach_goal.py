@@ -28,7 +28,8 @@ from tap_ros.nodes.planner.plan_view import CHOSEN
 from tap_ros.planning.mpc_config import PRESETS
 from tap_ros.ros import reaching
 from tap_ros.ros.calls import CallError
-from tap_ros.ros.reaching import Reaching, watch_sender
+from tap_ros.ros.goal_senders import watch_sender
+from tap_ros.ros.reaching import Reaching
 from tap_ros.ros.topics import LATCHED, LOCK_STEP, STREAM
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 from tap_ros.weights.weights import save_weights, stored_digest

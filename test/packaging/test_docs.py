@@ -10,10 +10,11 @@ import sys
 
 import cv2
 import pytest
+import tap_ros
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.md',
-           ROOT / 'QUALITY_DECLARATION.md',
+           ROOT / 'QUALITY_DECLARATION.md', ROOT / 'SECURITY.md',
            *sorted((ROOT / 'docs').glob('*.md'))]
 PAGES = [*WRITTEN, *(page for page in sorted((ROOT / 'docs' / 'results').glob('*.md'))
                      if not page.stem.endswith('findings'))]  # those are parts of pages
@@ -35,7 +36,11 @@ def anchors(page):
 
 
 def test_the_python_of_the_readme_runs_and_prints_what_it_says(tmp_path):
-    block, = re.findall(r'^```python\n(.*?)^```$', (ROOT / 'README.md').read_text(), re.M | re.S)
+    page = (ROOT / 'README.md').read_text()
+    block, = re.findall(r'^```python\n(.*?)^```$', page, re.M | re.S)
+    written = {f'{name}.png' for name in re.findall(r"\('(\w+)', \w+\)", block)}
+    command, = re.findall(r'-m tap_ros predict (.*)', page)
+    assert 'subgoal.png' in written and re.search(r'--out (\S+)', command)[1] not in written
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
     run = subprocess.run([sys.executable, '-c', block], cwd=tmp_path, capture_output=True,
@@ -44,6 +49,18 @@ def test_the_python_of_the_readme_runs_and_prints_what_it_says(tmp_path):
     said, = re.findall(r'print\(.*# (\[\[.*\]\])', block)
     assert run.stdout.split() == said.split()
     assert cv2.imread(str(tmp_path / 'subgoal.png')).shape == (256, 256, 3)
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path):
+    pytest.importorskip('sphinx', reason='make docs brings it')
+    run = subprocess.run(
+        [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-c', 'docs/site', '.',
+         tmp_path],
+        cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    api = (tmp_path / 'docs/site/api.html').read_text()
+    assert all(f'tap_ros.{name}' in api for name in tap_ros.__all__)
 
 
 @pytest.mark.parametrize('page', PAGES, ids=of)

@@ -6,8 +6,10 @@ Style that a machine can check: by ruff, and by the linters of ament where ROS 2
 ament_copyright is not among them: it knows no SPDX line.
 """
 
+import ast
 from importlib.util import find_spec
 from pathlib import Path
+import re
 import shutil
 import subprocess
 import sys
@@ -16,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = ('tap_ros', 'sim_bridge', 'experiments', 'test', 'launch', 'scripts')
-FILES = ('setup.py', 'docs/conf.py')
+FILES = ('setup.py', 'docs/conf.py', 'docs/site/conf.py')
 HEADER = ['# Copyright 2026 The tap_ros authors', '# SPDX-License-Identifier: Apache-2.0']
 CHECKS = {  # .flake8 gives the reasons of the options
     'ruff': ('check', '--no-cache', '.'),
@@ -34,6 +36,16 @@ def test_linters_find_nothing(name):
     if 'Failed to locate the main schema resource' in run.stdout:
         pytest.skip('the schema of package.xml is out of reach')
     assert run.returncode == 0, run.stdout.partition('\nChecked files:')[0]
+
+
+def test_docstrings_say_shapes_and_errors_instead_of_where_else_they_stand():
+    said = [f'{path}: {text[:60]}' for folder in FOLDERS[:2]
+            for path in (ROOT / folder).rglob('*.py')
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+            and (text := ast.get_docstring(node)) and re.search(
+                r'[Ll]ikewise|see (Predictor|ForwardModel|World|Tracker)\b', text)]
+    assert not said
 
 
 def test_headers_name_authors_and_license():

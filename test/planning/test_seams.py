@@ -11,7 +11,7 @@ import pytest
 import tap_ros
 from tap_ros import VisualMPC
 from tap_ros.base import plugins
-from tap_ros.base.errors import ConfigError
+from tap_ros.base.errors import ConfigError, WeightsError
 from tap_ros.planning.cost import PlanCost
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
@@ -94,6 +94,28 @@ def test_a_cost_of_ones_own_is_minimised_with_the_same_model():
     config = VisualMPCConfig(recheck=0, threads=1)
     end, _ = reach(VisualMPC(Telekinesis(), config, Away()), 10)
     assert end.outcome == 'spent'
+
+
+class Loaded(Telekinesis):
+    """Of the package of somebody else."""
+
+    @classmethod
+    def load(cls, argument, device='cpu'):
+        assert argument == 'anything'
+        return cls()
+
+
+def test_a_planner_is_loaded_by_the_names_that_its_node_takes(monkeypatch):
+    monkeypatch.setitem(plugins.BUILT_IN['tap_ros.forward_models'], 'loaded', f'{__name__}:Loaded')
+    assert isinstance(VisualMPC.load('loaded:anything').model, Loaded)
+    shipped = VisualMPC.load('push')
+    assert shipped.model.config == VisualMPC.load('order3').model.config
+    for name, error, said in (
+            ('pussh', WeightsError, "did you mean 'push'.*valid: push, push2"),
+            ('grasp', ConfigError, 'is a subgoal predictor'),
+            ('nowhere/push', WeightsError, 'nowhere/push: no such weights file')):
+        with pytest.raises(error, match=said):
+            VisualMPC.load(name)
 
 
 def test_solvers_of_other_packages_are_found_by_name(monkeypatch):

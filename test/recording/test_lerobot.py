@@ -58,7 +58,7 @@ def test_what_is_exported_comes_back(exported, truth, tmp_path, capsys):
         assert new.robot_masks is None and new.goal_frame is None
 
 
-def test_marks_are_the_ends_of_subtasks_and_come_back(truth, tmp_path, capsys):
+def test_with_a_mark_the_next_subtask_begins_and_marks_come_back(truth, tmp_path, capsys):
     bag = write_bag(tmp_path / 'bag', truth[:4])
     store, marks = open_recordings([bag], progress=False), {0: [(7, 7)], 2: [(3, 3), (9, 12)]}
     write_marks(beside(bag), store, [bag], marks)
@@ -72,8 +72,9 @@ def test_marks_are_the_ends_of_subtasks_and_come_back(truth, tmp_path, capsys):
             for i in range(4)]
     assert said == [['to mark 1', 'to the goal'], ['not marked'],
                     ['to mark 1', 'to mark 2', 'to the goal'], ['not marked']]
+    assert np.flatnonzero(np.diff(rows[rows.episode_index == 2].subtask_index)).tolist() == [2, 9]
     assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'back')]) == 0
-    assert 'marks where subtasks end, of 2 episodes' in capsys.readouterr().out
+    assert 'marks where the next subtask begins, of 2 episodes' in capsys.readouterr().out
     store = open_recordings([tmp_path / 'back'], progress=False)
     assert read_marks(beside(tmp_path / 'back'), store).episodes == {
         0: [(7, 7)], 2: [(3, 3), (10, 10)]}

@@ -13,7 +13,7 @@ from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.protocol import make_world
 from tap_ros.base.engines import Engine
-from tap_ros.base.errors import SceneError, TapError
+from tap_ros.base.errors import ConfigError, SceneError, TapError
 from tap_ros.recording.cache import open_recordings
 
 
@@ -112,7 +112,8 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
     folder = tmp_path / 'bag'
     config = CollectConfig(
         world='metaworld', task='plate-slide-v3', episodes=2, episodes_per_file=1, seed=3)
-    assert collect(folder, config, Engine(workers=1), progress=False)['success_rate'] == 1
+    told = collect(folder, config, Engine(workers=1), progress=False)
+    assert told['success_rate'] == 1 and told['bottlenecks'] == {'': 2}
     first, second = open_recordings(folder)
     assert (first.task, first.seed, first.outcome) == ('plate-slide-v3', 3, 'success')
     assert len({12, len(first), len(second)}) == 3, 'each goes its own way at its own speed'
@@ -157,6 +158,9 @@ class Slider:
     def movable(self):
         return np.array([self.thing])
 
+    def gap(self):
+        return min(self.thing - self.at[0], 0.03)
+
     def picture(self):
         return np.full((4, 4, 3), 100 * self.thing, np.uint8)
 
@@ -177,6 +181,57 @@ def test_the_bottleneck_is_where_the_hand_is_at_what_it_is_about_to_move():
         assert (things[:first] == 100).all() and 100 < things[last] < 112
         lengths.add(len(things))
     assert len(lengths) > 2, 'each goes at its own speed'
-    still = np.zeros((9, 3))
-    assert find_bottleneck(still, np.zeros((9, 1))) is None, 'nothing moves'
-    assert find_bottleneck(still, np.arange(9.0)[:, None]) is None, 'it moves from the start on'
+
+
+def test_what_settles_or_is_struck_in_passing_is_not_the_bottleneck_and_why_none_is_known():
+    hand = np.zeros((20, 3))
+    hand[:, 0] = [0, 0, .1, .2, .2, .1, .0, -.1, .2, .4, .6, .8, .98, .98, 1, 1, 1, 1.02, 1.1, 1.5]
+    thing = np.where(np.arange(20) < 3, 0.85, 0.9) + np.maximum(0, hand[:, 0] - 1)  # it settles
+    gap = np.clip(1 - hand[:, 0], 0, 0.03)
+
+    def found(gap=gap, thing=thing):
+        return find_bottleneck(hand, thing[:, None], gap)
+    assert found() == ((14, 18), '')
+    gap[3:5], thing[4:] = 0.001, thing[4:] + 0.1  # on a detour
+    assert found() == ((14, 18), '')
+    assert found(thing=np.ones(20)) == (None, 'nothing moves')
+    assert found(np.full(20, 0.03)) == (None, 'the robot touches nothing that moves')
+    assert found(np.zeros(20)) == (None, 'the hand is there from the start')
+    late = np.arange(20) == 19
+    assert found(np.where(late, 0, 0.03), 1.0 * late) == (
+        None, 'the hand comes with the last frame')
+
+
+def test_pushes_are_recorded_as_a_planner_and_its_model_need_them(tmp_path):
+    pytest.importorskip('metaworld')
+    for task, pushes in (('plate-slide-v3', 'goal'), ('push-v3', 'random')):
+        folder = tmp_path / task
+        config = CollectConfig(world='metaworld', task=task, pushes=pushes, episodes=1,
+                               seed=3, image_size=32)
+        collect(folder, config, Engine(workers=1), progress=False)
+        episode, = open_recordings(folder)
+        assert episode.object_source == 'ground_truth' and episode.robot_masks.any()
+        moved = episode.grippers[1:, :3] - episode.grippers[:-1, :3]
+        assert np.median(np.abs(moved - episode.actions[:-1, :3])) < 0.01, 'as it was told'
+        if pushes == 'goal':
+            assert (episode.task, episode.outcome) == (task, 'success')
+            places = episode.object_poses[:, 0]
+            way = np.linalg.norm(places - places[0], axis=1)
+            assert way[:4].max() < 0.01 and way[-1] > 0.1
+    for bad, words in (({'task': 'door-open-v3'}, 'nothing can be pushed about in door-open-v3'),
+                       ({'world': 'mujoco_table', 'task': 'push2'}, 'see misses')):
+        with pytest.raises(ConfigError, match=words):
+            collect(tmp_path / 'bad', replace(config, **bad), progress=False)
+    assert not (tmp_path / 'bad').exists()
+
+
+def test_what_stands_in_the_way_is_passed_by():
+    pytest.importorskip('metaworld')
+    world = make_world('metaworld', 'push-wall-v3', 32)
+    around = [world.demonstrate(seed, pushes='goal').episode for seed in (500, 501)]
+    assert {episode.outcome for episode in around} == {'success'}
+    for episode in around:
+        for way in world.ways:
+            gaps = episode.object_poses[:, 0, :2] - way
+            assert np.linalg.norm(gaps, axis=1).min() < 0.06
+    world.close()

@@ -8,7 +8,7 @@ import cv2
 from made_episodes import move_squares
 import numpy as np
 import pytest
-from tap_ros import Predictor
+from tap_ros import Predictor, SubgoalPredictor
 from tap_ros.__main__ import main
 from tap_ros.base import plugins
 from tap_ros.base.errors import ConfigError, WeightsError
@@ -104,6 +104,8 @@ def test_predictors_go_by_name_also_those_of_other_packages(bag, tmp_path, monke
                               ('nowhere/push2.safetensors', WeightsError, 'no such weights')):
         with pytest.raises(error, match=said):
             load_predictor(name)
+    with pytest.raises(WeightsError, match="did you mean 'push2'.*valid: .*stack3"):
+        SubgoalPredictor.load('pusch2')
     start, goal, out = (str(tmp_path / f'{name}.png') for name in ('start', 'goal', 'out'))
     for path, frame in ((start, 0), (goal, -1)):
         cv2.imwrite(path, EPISODES[0].frames[frame][..., ::-1])

@@ -87,8 +87,8 @@ class Options:
     :param robot_mask: what is taken out of pictures, as it was in the training of the weights.
     :param objects: where they come from: tracked, from a click on each in the first picture, or
         truth, the simulator; so it is in another world.
-    :param look: of the world, see sim_node.
-    :param arm: at the table, see sim_node.
+    :param look: of the world: the whole arm at its table, or its hand alone.
+    :param arm: at the table.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
     """
 

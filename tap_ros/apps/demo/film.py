@@ -170,18 +170,31 @@ def _frame(scene: Scene, t: int) -> np.ndarray:
     rows = [_line(f'{order_in_words(scene)}.')] if scene.order else []
     for mode, run in scene.runs.items():
         step = min(t, len(run.pictures) - 1)
-        rows.append(np.concatenate([_line(*_title(scene, mode, step)), np.concatenate([
-            scene.headed(run.heading_at(step)), beside, scene.seen(mode, step)], 1)]))
+        heading = run.heading_at(step)
+        aim = _named(scene.headed(heading),
+                     'goal picture' if heading == GOAL else 'predicted subgoal')
+        now = _named(scene.seen(mode, step), 'now; arrows: where to')
+        rows.append(np.concatenate([
+            _line(*_title(scene, mode, step)), np.concatenate([aim, beside, now], 1)]))
     gap = np.full((GAP, WIDTH, 3), 255, np.uint8)
     return np.concatenate([part for row in rows for part in (gap, row)])
+
+
+def _named(panel: np.ndarray, name: str) -> np.ndarray:
+    """Write the name of a panel into its lower left corner."""
+    image = Image.fromarray(panel)
+    ImageDraw.Draw(image).text(
+        (8, len(panel) - 8), name, (255, 255, 255), ImageFont.load_default(15), anchor='ls',
+        stroke_width=2, stroke_fill=INK)
+    return np.array(image)
 
 
 def order_in_words(scene: Scene) -> str:
     """Say which order works, and why."""
     numbers = ', '.join(str(i + 1) for i in range(len(scene.order)))
     return f'Only the order {numbers} works: ' + (
-        '1 stands where 2 has to go' if len(scene.order) == 2 else
-        'each stands where the next has to go')
+        'object 1 is in the way of object 2' if len(scene.order) == 2
+        else 'each is in the way of the next')
 
 
 def _title(scene: Scene, mode: str, t: int) -> tuple[str, str, tuple[int, int, int]]:
@@ -193,12 +206,12 @@ def _title(scene: Scene, mode: str, t: int) -> tuple[str, str, tuple[int, int, i
         name = ('Subgoal done, now the goal picture' if heading == GOAL else
                 f'Predicted subgoal: {scene.decided(run.subgoals[heading])}')
     distances = run.distances[t]
-    left = f'{scene.numbers[distances.argmax()]} is {100 * distances.max():.0f} cm off'
+    far = f'object {scene.numbers[distances.argmax()]}, {100 * distances.max():.0f} cm'
     if t < len(run.distances) - 1:
-        return name, left, INK
+        return name, f'farthest off: {far}', INK
     limit = f'{100 * SUCCESS_DISTANCE:.0f} cm'
     return (name, f'reached: all within {limit}', GOOD) if run.reached else (
-        name, f'failed: {left}', BAD)
+        name, f'failed: {far} off', BAD)
 
 
 def _line(left: str, right: str = '', colour: tuple[int, int, int] = INK) -> np.ndarray:

@@ -14,8 +14,9 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from tap_msgs.action import ReachGoal
 from tap_ros.apps.explorer.display import Display, GoalByHand, simulated
+from tap_ros.apps.explorer.words import plain
 from tap_ros.base.errors import TapError
-from tap_ros.base.text import escaped, listing
+from tap_ros.base.text import escaped
 from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
 from tap_ros.ros.calls import CallError, reason
 from tap_ros.ros.client import Client
@@ -53,6 +54,10 @@ COMMANDS: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {  # do: {fi
     'propose': {},  # objects to follow
     'move': _PLACE,  # an object's goal, in the picture where the page drags them
     'photograph': {}}  # take the camera's newest picture as the goal
+REFUSED = {  # of each, when it could not be done
+    'reset': 'no new scene', 'predict': 'no subgoal', 'reach': 'the arm stopped',
+    'cancel': 'not cancelled', 'select': 'not followed', 'propose': 'nothing found',
+    'move': 'the goal was not moved', 'photograph': 'no goal picture'}
 
 
 def parse_command(text: str | bytes) -> tuple[str, dict[str, Any]]:
@@ -87,6 +92,7 @@ class ExplorerCalls:
     :param node: rclpy Node that another thread spins.
     :param display: that shows what happens.
     :param on_error: called with what went wrong for which nobody but us is to blame.
+    :ivar end: how the last goal of a browser ended, in words, and whether it was reached.
     """
 
     def __init__(self, node: Node, display: Display, on_error: Callable[[str], object]) -> None:
@@ -97,6 +103,7 @@ class ExplorerCalls:
         self._goal: Reaching | None = None
         self._asked = self._cancelled = self._ending = False  # asked: by a browser, for a goal
         self._stage = ''
+        self.end: dict[str, Any] = {'end': '', 'reached': False}
         self._under_way = False  # a goal, whoever sent it
         self._planner: Presence | None = None  # that said so
         node.create_subscription(GoalStatusArray, STATUS, self._on_status,
@@ -119,6 +126,10 @@ class ExplorerCalls:
         """What the goal in progress is doing."""
         return self._client.silence('visual_mpc_node') or self._stage or (
             "another client's goal" if not self._asked else '')
+
+    def forget_end(self) -> None:
+        """Forget how the last goal ended: there is another one."""
+        self.end = {'end': '', 'reached': False}
 
     def do(self, text: str | bytes) -> None:
         """
@@ -167,8 +178,13 @@ class ExplorerCalls:
         except Exception as error:
             if isinstance(error, TapError) or not self._ending:  # else it is being taken down
                 text = escaped(reason(self._node, do, error), 1000)
-                self._display.add_problem(text)
-                if not isinstance(error, TapError):
+                said = f'{REFUSED[do]}: {plain(text)}'
+                self._display.events.add(said, problem=True)
+                if do == 'reach':
+                    self.end = {'end': said, 'reached': False}
+                if isinstance(error, TapError):
+                    self._node.get_logger().info(f'{do}: {text}')
+                else:
                     self._on_error(text)
         finally:
             if do == 'reach':
@@ -179,28 +195,28 @@ class ExplorerCalls:
         return self._client.call(service, give_up=lambda: self._ending, **fields)
 
     def _reset(self, task: str, seed: int) -> None:
-        response = self._call('reset', task=task, seed=seed)
-        self._display.add_line(f'reset: {escaped(response.message)}')
+        self._call('reset', task=task, seed=seed)
         if task in PREDICTORS and self._client.is_ready('predict'):
             weights = self._client.weights()
             if weights not in PREDICTORS:
-                self._display.add_line(
+                self._display.events.add(
                     f'the predictor keeps {escaped(weights)}, which may not know {task}')
             elif weights != task and not weights.startswith(f'{task}_'):
                 self._client.use_weights(task)
-                self._display.add_line(f'the predictor has the weights of {task} now')
+                self._display.events.add(f'the predictor has the weights of {task} now')
 
     def _select(self, objects: list[dict[str, Any]]) -> None:
         response = self._call('select', names=[one['name'] for one in objects],
                               u=[float(one['u']) for one in objects],
                               v=[float(one['v']) for one in objects])
         self._display.select(response, followed=True)
-        self._display.add_line(f'following {listing(one.name for one in response.objects)}')
+        self._display.events.add(escaped(response.message, 1000))
 
     def _propose(self) -> None:
         response = self._call('select', propose=True)
         self._display.select(response, followed=False)
-        self._display.add_line(f'{len(response.objects)} objects proposed')
+        self._display.events.add(
+            f'found {len(response.objects)}, which the goal shows elsewhere')
 
     def _move(self, name: str, u: float, v: float) -> None:
         display = self._display
@@ -212,27 +228,28 @@ class ExplorerCalls:
         else:
             self._by_hand.place(name, (u, v), {
                 kind: message for kind, (message, _) in display.newest.copy().items()})
-        display.add_line(f'goal: {escaped(name)} to pixel {u:.1f}, {v:.1f}')
+        display.events.add(f'goal: {escaped(name)} to pixel {u:.0f}, {v:.0f}', 'goal')
 
     def _photograph(self) -> None:
         if self.offered('reset'):
             raise CallError('photograph: the simulator takes its goal pictures itself')
         self._by_hand.photograph(
             self._display.newest.get('camera'), followed=self.offered('select'))
-        self._display.add_line('goal: what the camera sees now')
+        self._display.events.add('goal: what the camera sees now', 'goal')
 
     def _cancel(self) -> None:
         self._call('cancel')
-        self._display.add_line('cancel: the planner was asked to end its goal, whoever sent it')
+        self._display.events.add('cancel: the planner ends its goal, whoever sent it')
 
     def _predict(self) -> None:
         response = self._call('predict')
-        self._display.add_line(f'predicted in {response.model_time_ms:.0f} ms: '
-                        f'{escaped(response.message, 300)}')
+        self._display.events.add(f'predicted in {response.model_time_ms:.0f} ms: '
+                                 f'{escaped(response.message, 300)}', 'subgoal')
 
     def _reach(self, mode: str) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self._stage = f'{words}: waiting for the planner'
+        self.forget_end()
         cancelled = self._cancelled
         if cancelled:
             raise CallError(f'{words}: cancelled before it began')
@@ -242,10 +259,14 @@ class ExplorerCalls:
             self._goal, cancelled = goal, self._cancelled
         if cancelled:  # meanwhile
             goal.cancel()
-        self._display.add_line(f'{words}: begun')
+        self._display.events.add(f'{words}: begun')
         result = goal.result()
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
-        self._display.add_line(f'{words}: {end} ({result.steps} steps)')
+        if result.end == 'succeeded' and not result.success:  # of its steps none is left
+            end += '; go again to come nearer'
+        end = f'{words}: {end} ({result.steps} steps)'
+        self.end = {'end': end, 'reached': result.success}
+        self._display.events.add(end)
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
         self._stage = (f'step {feedback.step}, to the {escaped(feedback.stage, 60)}, plan in '

@@ -22,7 +22,7 @@ class Options:
 
     :param task: of the first scene; its predictor is the one that is started.
     :param seed: of the first scene.
-    :param look: of the world, see sim_node.
+    :param look: of the world: the whole arm at its table, or its hand alone.
     :param objects: whether tracker_node follows those that are clicked, or the simulator tells.
     :param host: address at which browsers find the page; 0.0.0.0: of every network of this
         machine, with a token.

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What browsers are shown, and goals made by hand of it where no simulator takes goal pictures."""
 
-from collections import deque
 from collections.abc import Mapping
 from functools import cache
 import json
@@ -16,6 +15,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import SelectObjects
+from tap_ros.apps.explorer.events import Events
 from tap_ros.base.contract import SEEN
 from tap_ros.base.errors import TapError
 from tap_ros.base.plugins import load_plugin
@@ -29,7 +29,6 @@ from tap_ros.ros.topics import encode_objects, LATCHED
 
 SILENT_S = 2.0  # after which the page says that a topic is silent
 NEAR = 0.06  # of the picture's width: so near are two pixels of one object
-LOG_LINES = 50
 NOTHING_SELECTED = json.dumps(
     {'kind': 'selection', 'count': 0, 'followed': True, 'objects': []})
 
@@ -44,8 +43,7 @@ class Display:
     :ivar lock: of all that changes; newest: {kind: newest message, when it was received}.
     :ivar sizes: {kind: (width, height)} of pictures before they are made smaller.
     :ivar selection: what select_objects answered last, as JSON for the page.
-    :ivar log: the newest of log_count lines.
-    :ivar problem: what could not be done last.
+    :ivar events: what happened.
     """
 
     def __init__(self, node: Node) -> None:
@@ -54,21 +52,16 @@ class Display:
         self.newest: dict[str, tuple[Any, float]] = {}
         self.sizes: dict[str, tuple[int, int]] = {}
         self.selection, self._selections = NOTHING_SELECTED, 0
-        self.log: deque[str] = deque(maxlen=LOG_LINES)
-        self.log_count = 0
-        self.problem: dict[str, Any] = {'count': 0, 'text': ''}
+        self.events = Events(self.picture)
 
-    def add_line(self, text: str) -> None:
-        """Write a line that all browsers show."""
-        with self.lock:
-            self.log.append(text)
-            self.log_count += 1
-
-    def add_problem(self, text: str) -> None:
-        """Say to all browsers what could not be done."""
-        with self.lock:
-            self.add_line(text)
-            self.problem = {'count': self.problem['count'] + 1, 'text': text}
+    def picture(self, kind: str) -> np.ndarray | None:
+        """Return the newest picture of a kind, uint8 (H, W, 3); None where there is none."""
+        message, _ = self.newest.get(kind, (None, 0.0))
+        try:
+            return None if message is None else picture_of(message, kind)
+        except TapError as error:
+            self.warn(error)
+            return None
 
     def select(self, response: SelectObjects.Response, followed: bool) -> None:
         """

@@ -15,7 +15,7 @@ from tap_msgs.msg import Episode, ObjectStates, Subgoal
 from tap_ros.apps.explorer import display
 from tap_ros.apps.explorer.browser_commands import ExplorerCalls
 from tap_ros.apps.explorer.server import ExplorerServer
-from tap_ros.base.errors import TapError
+from tap_ros.apps.explorer.words import NodeStates
 from tap_ros.base.plugins import names
 from tap_ros.base.text import escaped
 from tap_ros.images.drawing import picture_bytes
@@ -24,12 +24,17 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
 from tap_ros.ros.parameters import Parameters, setting
-from tap_ros.ros.subscriptions import adapt_regularly, AdaptiveSubscription, steady_timer
+from tap_ros.ros.subscriptions import (
+    adapt_regularly,
+    AdaptiveSubscription,
+    publishers_of,
+    steady_timer,
+)
 from tap_ros.ros.topics import camera_image, LATCHED, STREAM
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
-STALE = 3  # of diagnostic_msgs/DiagnosticStatus
 OBSERVER = 'observer/image_raw'
+OF_A_SCENE = ('objects', 'goal_objects', 'subgoal', 'plan')
 PICTURES = ('camera', 'goal', 'subgoal', 'plan', 'observer')
 
 
@@ -46,8 +51,10 @@ class ExplorerNode(Node):
         self.params = declare_parameters(self)
         self._display = display.Display(self)
         self._changed: set[str] = set()  # kinds whose newest message was not shown yet
-        self._states: dict[str, tuple[int, str, float]] = {}  # level, text, when it came
+        self._states = NodeStates()
         self._task = self.params['task']
+        self._seed: int | None = None  # of the scene, once it is told
+        self._scenes = 0  # that have begun
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
         kind, topic = camera_image(self.params)
         self._diagnostics = Diagnostics(
@@ -96,9 +103,9 @@ class ExplorerNode(Node):
                     return
                 if name == 'goal' and before not in (None, message):
                     self._forget('subgoal', 'plan')  # they are for another goal
-                if name in ('subgoal', 'plan') and (
-                        0 < to_nanoseconds(message.header.stamp) < self._scene_ns):
-                    return  # of an old scene; stamp 0: of a file
+                    self._calls.forget_end()
+                if name in OF_A_SCENE and self._is_old(message):
+                    return
                 newest[name] = message, reception_time(info)
                 self._changed.add(name)
         return AdaptiveSubscription(self, kind, topic, keep, qos)
@@ -112,45 +119,54 @@ class ExplorerNode(Node):
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:
-            self._task = escaped(message.task, 40)
+            self._task, self._seed = escaped(message.task, 40), message.seed
+            self._display.events.add(f'scene: {self._task}, seed {self._seed}')
+            self._calls.forget_end()
+            self._scenes += 1
             with self._display.lock:
                 self._display.selection = display.NOTHING_SELECTED
                 if self._calls.offered('reset'):  # stamps are the simulator's
                     self._scene_ns = to_nanoseconds(message.header.stamp)
                 self._forget('subgoal', 'plan')
+                for kind in ('objects', 'goal_objects'):
+                    if self._is_old(self._display.newest.get(kind, [ObjectStates()])[0]):
+                        self._display.newest.pop(kind)
+
+    def _is_old(self, message: Any) -> bool:
+        """Return whether a message is of an old scene; not with stamp 0, as that of a file."""
+        return 0 < to_nanoseconds(message.header.stamp) < self._scene_ns
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            self._states[escaped(status.name, 100)] = (
-                status.level[0], escaped(status.message, 200), time.monotonic())
+        self._states.take(message, time.monotonic())
 
     # What is shown
 
     def _show(self) -> None:
         """Bring what browsers see up to date."""
-        # Before the log: how a run ended is told first, so that who sees no run sees how it ended.
-        running, shown = self._calls.running, self._display
-        stage = self._calls.stage if running else ''
+        # Before the events: how a run ended is told first, so that who sees no run sees how.
+        calls, shown = self._calls, self._display
+        running = calls.running
+        stage = calls.stage if running else ''
         self._server.put('selection', shown.selection)
+        shown.events.look()
+        self._server.put('events', shown.events.text)
         if not self._server.browsers:
             return
         with shown.lock:
             newest, changed, self._changed = dict(shown.newest), self._changed, set()
-            log, log_count, problem = list(shown.log), shown.log_count, shown.problem
         for kind in changed & {*PICTURES}:
-            try:
-                image = display.picture_of(newest[kind][0], kind)
+            image = shown.picture(kind)
+            if image is not None:
                 shown.sizes[kind] = image.shape[1], image.shape[0]
                 self._server.put(kind, picture_bytes(image, kind == 'plan'))
-            except TapError as error:
-                shown.warn(error)
         objects, goals = shown.places('objects'), shown.places('goal_objects')
-        now, simulator = time.monotonic(), self._calls.offered('reset')
+        now, simulator, tracker = (
+            time.monotonic(), calls.offered('reset'), calls.offered('select'))
         self._server.put('state', json.dumps({
-            'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
-            'simulator': simulator,
+            'kind': 'state', 'tasks': names('tap_ros.tasks'), 'task': self._task,
+            'seed': self._seed, 'scene': self._scenes, 'simulator': simulator, 'tracker': tracker,
+            'predictor': calls.offered('predict'), 'planner': calls.offered('cancel'),
             'plans': not simulator or not display.grips(self._task),
-            'tracker': self._calls.offered('select'),
             'observer': self.count_publishers(OBSERVER) > 0,
             'movable': '' if running else self._movable(
                 bool(objects), bool(goals), 'goal' in newest),
@@ -161,13 +177,14 @@ class ExplorerNode(Node):
             'goal': {**shown.size('goal'),
                      'objects': display.listed(goals, newest.get('goal_objects', [None])[0]),
                      'pictured': 'goal' in newest},
-            'problem': problem, 'run': {'running': running, 'stage': stage},
-            'diagnostics': [
-                {'name': name, 'level': level, 'message': text}
-                if now - came <= display.SILENT_S + 1 else
-                {'name': name, 'level': STALE, 'message': 'silent'}
-                for name, (level, text, came) in sorted(self._states.items())],
-            'log': log, 'log_count': log_count}))
+            'problem': shown.events.problem, 'events': shown.events.count,
+            'run': {'running': running, 'stage': stage, **calls.end},
+            'nodes': self._states.lines(now, self._present, tracker)}))
+
+    def _present(self) -> set[str]:
+        """Return the full names of the nodes that may say how they are."""
+        (_, publishers), = publishers_of(self, '/diagnostics').items()
+        return set().union(*publishers.values())
 
     def _movable(self, objects: bool, goals: bool, pictured: bool) -> str:
         """Return in which picture objects can be dragged to their goals; '' in none."""

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
-from importlib.resources import files
 import json
 import socket
 import threading
@@ -42,7 +41,7 @@ class ExplorerServer(PageServer):
 
     def __init__(self, on_command: Callable[[bytes], object], host: str = '127.0.0.1',
                  port: int = 8000, token: str = '') -> None:
-        super().__init__(files('tap_ros.apps.explorer').joinpath('page'), host, port, token)
+        super().__init__('explorer/page', host, port, token)
         self._on_command = on_command
         self._contents: dict[str, tuple[int, str | bytes]] = {}  # kind -> (number, content)
         self._count = 0  # of changes

@@ -2,7 +2,6 @@
 // SPDX-License-Identifier: Apache-2.0
 'use strict';
 
-const at = (id) => document.getElementById(id);
 const THUMBNAILS = 14;
 const ASK_AGAIN_MS = 1500;  // while labels are being found
 const BESIDE_S = 0.5;  // between a label and where the hand moves, which is taken for it
@@ -18,8 +17,7 @@ const passed = new Set();  // shown and left unmarked
 let done = Promise.resolve();  // when the server has all marks
 
 const names = () => state.names;
-const say = (text) => { at('said').textContent = text; };
-const made = (kind, text, click) => Object.assign(document.createElement(kind), {textContent: text, onclick: click});
+const say = (text) => { $('said').textContent = text; };
 const second = (t) => `${about.seconds[t].toFixed(1)} s`;
 const nameOf = (k) => names()[k] || (draft.length > 1 || !names().length ? `mark ${k + 1}` : '');
 const isSaved = () => String(draft) === String(state.marks[episode] || []);
@@ -45,8 +43,9 @@ function proposed() {
 function show(t) {
   const last = state.lengths[episode] - 1;
   frame = Math.max(0, Math.min(t, last));
-  at('now').src = `frame/${episode}/${frame}`;
-  at('slider').value = frame;
+  $('now').src = `frame/${episode}/${frame}`;
+  $('slider').value = frame;
+  $('slider').ariaValueText = second(frame);
   draw();
 }
 
@@ -58,53 +57,52 @@ function go(t) {
 
 function draw() {
   const last = state.lengths[episode] - 1, count = Object.keys(state.marks).length;
-  at('now').classList.toggle('marked', draft.includes(frame));
-  at('where').textContent = `${second(frame)} of ${second(last)}, frame ${frame} of ${last}`;
-  at('count').textContent = `${count} of ${Math.max(state.enough, count)} marked`;
-  at('busy').textContent = state.busy ? 'finding labels …' : '';
-  at('play').textContent = playing ? 'Stop' : 'Play';
+  $('now').classList.toggle('marked', draft.includes(frame));
+  $('where').textContent = `${second(frame)} of ${second(last)}, frame ${frame} of ${last}`;
+  $('count').textContent = `${count} of ${Math.max(state.enough, count)} marked`;
+  $('busy').textContent = state.busy ? 'finding labels …' : '';
+  $('play').textContent = playing ? 'Stop' : 'Play';
   const listed = draft.map((t, k) => t === null ? `${nameOf(k)} not yet` : `${nameOf(k)} ${second(t)}`);
   const guess = labels().map(([t, sure], k) => `${names()[k] || ''} ${second(t)} (${Math.round(100 * sure)}%)`);
-  at('title').textContent = `Demonstration ${episode} of 0 to ${state.lengths.length - 1}: ` +
+  $('title').textContent = `Demonstration ${episode} of 0 to ${state.lengths.length - 1}: ` +
     (given().length ? listed.join(', ') + (isSaved() ? '' : ' (not saved)') : 'nothing marked') + (guess.length ? `; label: ${guess.join(', ')}` : '');
-  at('file').textContent = `saved at once in ${state.file}`;
+  $('file').textContent = `saved at once in ${state.file}`;
   drawTicks(last);
-  for (const one of at('strip').children) {
+  for (const one of $('strip').children) {
     const inside = (t) => Number(one.dataset.first) <= t && t <= Number(one.dataset.last);
     one.className = (draft.some((t) => t !== null && inside(t)) ? 'marked ' : labels().some(([t]) => inside(t)) ? 'labelled ' : '') +
       (inside(frame) ? 'here' : '');
   }
-  at('names').replaceChildren(...(names().length ? names() : ['Mark']).map((name, k) =>
-    made('button', names().length ? `${k + 1} ${name}` : name, () => mark(names().length ? k : null))));
+  const free = Math.max(0, draft.indexOf(null));  // what Enter marks
+  fill($('names'), names().length ? names() : ['Mark'], (name, k) => Object.assign(
+    button(names().length ? `${k + 1} ${name}` : name, () => mark(names().length ? k : null)), {className: k === free ? 'main' : ''}));
   const offer = proposed();
-  at('accept').hidden = !offer.length || String(offer) === String(draft);
-  at('accept').textContent = `a accept ${offer.map(second).join(', ')}`;
-  at('list').replaceChildren(...Object.entries(state.marks).map(([i, frames]) => {
-    const item = document.createElement('li');
-    item.append(made('button', `${i}: ${state.seconds[i].map((s) => `${s.toFixed(1)} s`).join(', ')}`,
-      () => { visit(Number(i), frames[0]); }));
-    item.className = Number(i) === episode ? 'here' : '';
-    return item;
-  }));
-  at('commands').replaceChildren(...(state.commands.length ? [
-    made('p', 'Enough to begin with. In a terminal, label all demonstrations, or train on the marks:'),
-    ...state.commands.map((words) => made('pre', words))] : []));
+  $('accept').hidden = !offer.length || String(offer) === String(draft);
+  $('accept').textContent = `a accept ${offer.map(second).join(', ')}`;
+  fill($('list'), Object.entries(state.marks), ([i, frames]) => made('li', {className: Number(i) === episode ? 'here' : ''},
+    button(`${i}: ${state.seconds[i].map((s) => `${s.toFixed(1)} s`).join(', ')}`, () => { visit(Number(i), frames[0]); })));
+  if (!count) $('list').append(made('li', {className: 'soft'}, 'What you mark is listed here.'));
+  fill($('commands'), state.commands, (words) => made('pre', {}, words));
+  if (state.commands.length) $('commands').prepend(
+    made('p', {}, 'Enough to begin with. In a terminal, label all demonstrations, or train on the marks:'));
 }
 
-// The ticks of a demonstration: [frame, kind, text].
+// The ticks of a demonstration: [frame, kind, text]; a label until its mark is there.
 function ticks() {
   return [...about.moves.map(([t, closes]) => [t, 'move', closes === null ? 'hand' : closes ? 'closes' : 'opens']),
-    ...labels().map(([t], k) => [t, 'label', `${names()[k] || 'label'}?`]),
+    ...labels().map(([t], k) => [t, 'label', `${names()[k] || 'label'}?`]).filter((_, k) => (draft[k] ?? null) === null),
     ...draft.flatMap((t, k) => t === null ? [] : [[t, isSaved() ? 'mark' : 'draft', nameOf(k)]])];
 }
 
+// Moves in a row of their own; a text that would lie over the one before is left to its tick's title.
 function drawTicks(last) {
-  at('ticks').replaceChildren(...ticks().map(([t, kind, text]) => {
-    const tick = made('button', text, () => go(t));
-    tick.className = kind;
-    tick.style.left = `${100 * t / last}%`;
-    return tick;
-  }));
+  const ends = {}, width = $('ticks').clientWidth;
+  fill($('ticks'), ticks().sort(([one], [other]) => one - other), ([t, kind, text]) => {
+    const row = kind === 'move', half = 4 * text.length, middle = width * t / last, room = middle - half > (ends[row] ?? -half);
+    if (room) ends[row] = middle + half;
+    return Object.assign(button(room ? text : '', () => go(t)),
+      {className: kind, title: `${text}, ${second(t)}`, ariaLabel: `${text}, ${second(t)}`, style: `left: ${100 * t / last}%`});
+  });
 }
 
 async function open(i, wanted) {
@@ -116,12 +114,12 @@ async function open(i, wanted) {
   say('');
   takeMarks();
   const length = state.lengths[i];
-  at('slider').max = length - 1;
-  at('number').value = i;
-  at('start').src = `frame/${i}/0`;
-  at('goal').src = `frame/${i}/${length - 1}`;
+  $('slider').max = length - 1;
+  $('number').value = i;
+  $('start').src = `frame/${i}/0`;
+  $('goal').src = `frame/${i}/${length - 1}`;
   const count = Math.min(THUMBNAILS, length);
-  at('strip').replaceChildren(...Array.from({length: count}, (_, n) => {
+  $('strip').replaceChildren(...Array.from({length: count}, (_, n) => {
     const image = new Image();
     image.dataset.first = Math.ceil(n * length / count);
     image.dataset.last = Math.ceil((n + 1) * length / count) - 1;
@@ -235,7 +233,7 @@ async function play() {
     if (!playing || about.seconds[frame + 1] > now) continue;
     const later = about.seconds.findIndex((s) => s > now);
     show(later < 0 ? last : later - 1);
-    await at('now').decode().catch(() => {});
+    await $('now').decode().catch(() => {});
   }
   if (i === episode) { playing = false; draw(); }
 }
@@ -246,24 +244,26 @@ document.addEventListener('keydown', (event) => {
     ArrowUp: () => fromTickToTick(-1), ArrowDown: () => fromTickToTick(1),
     Enter: () => mark(), n: next, p: previous, a: accept, ' ': play}[key] ||
     (/^[1-9]$/.test(key) && (() => mark(Number(key) - 1)));
-  if (!about || !action || event.target === at('number') || event.ctrlKey || event.altKey || event.metaKey) return;
+  if (!about || !action || event.target === $('number') || event.ctrlKey || event.altKey || event.metaKey) return;
+  if ([' ', 'Enter'].includes(key) && event.target.matches('button, summary')) return;  // somebody came there by keys
   event.preventDefault();
   action();
 });
-at('slider').oninput = () => go(Number(at('slider').value));
-at('now').onclick = () => mark();
-at('now').onload = () => at('now').classList.toggle('small', at('now').naturalWidth < 200);
-at('next').onclick = next;
-at('previous').onclick = previous;
-at('play').onclick = play;
-at('accept').onclick = accept;
-at('back').onclick = () => go(frame - 1);
-at('on').onclick = () => go(frame + 1);
-at('number').onchange = () => {
-  const i = Number(at('number').value), count = state.lengths.length;
-  at('number').blur();
+document.addEventListener('click', (event) => { if (event.detail) document.activeElement.blur(); });  // of a pointer
+$('slider').oninput = () => go(Number($('slider').value));
+$('now').onclick = () => mark();
+$('now').onload = () => $('now').classList.toggle('small', $('now').naturalWidth < 200);
+$('next').onclick = next;
+$('previous').onclick = previous;
+$('play').onclick = play;
+$('accept').onclick = accept;
+$('back').onclick = () => go(frame - 1);
+$('on').onclick = () => go(frame + 1);
+$('number').onchange = () => {
+  const i = Number($('number').value), count = state.lengths.length;
+  $('number').blur();
   if (Number.isInteger(i) && i >= 0 && i < count) visit(i);
-  else { say(`There are demonstrations 0 to ${count - 1}.`); at('number').value = episode; }
+  else { say(`There are demonstrations 0 to ${count - 1}.`); $('number').value = episode; }
 };
 
 (async () => {

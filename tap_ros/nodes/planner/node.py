@@ -35,11 +35,12 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.ros.calls import reason
 from tap_ros.ros.client import Client
 from tap_ros.ros.diagnostics import Diagnostics
+from tap_ros.ros.goal_senders import watch_sender
 from tap_ros.ros.lifecycle import LifecycleBase
-from tap_ros.ros.reaching import watch_sender
 from tap_ros.ros.robot_view import warn_if_unlike
 from tap_ros.ros.subscriptions import publishers_of, steady_timer
 from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, STREAM, to_stamp
+from tap_ros.weights import find_forward_model
 
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'
@@ -129,7 +130,7 @@ class VisualMpcNode(LifecycleBase):
 
     def files(self) -> list[Path]:
         """Return the file of the weights."""
-        return [settings.weights_file(self.params['weights'])]
+        return [find_forward_model(self.params['weights'])]
 
     def resume(self) -> None:
         """Serve goals again, once the last one has ended."""
@@ -330,8 +331,9 @@ class VisualMpcNode(LifecycleBase):
         self._diagnostics.took(plan.planning_ms, 'plan')
         self._distance.publish(Float64(data=reach.distance))
         if self._overlay.get_subscription_count():
-            picture = draw_plan(seen.image, self._model.config, plan, seen.gripper,
-                                reach.targets[command.stage].pixels)
+            picture = draw_plan(
+                seen.image, self._model.config, plan, seen.gripper,
+                reach.targets[command.stage].pixels, self._inputs.sharp(seen))
             self._overlay.publish(encode_image(
                 picture, to_stamp(seen.stamp_ns), self._inputs.frame_id))
         stage = 'goal' if command.stage == subgoals else 'subgoal' + (

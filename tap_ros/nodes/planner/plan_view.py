@@ -19,7 +19,7 @@ CHOSEN, ELITES, GRIPPER = (255, 225, 40), (150, 225, 255), (255, 50, 50)
 
 
 def draw_plan(image: np.ndarray, config: ForwardModelConfig, plan: Plan, gripper: np.ndarray,
-              targets: np.ndarray) -> np.ndarray:
+              targets: np.ndarray, sharp: np.ndarray | None = None) -> np.ndarray:
     """
     Draw where a plan and those it was chosen from lead the fingertips, and where objects shall be.
 
@@ -28,11 +28,14 @@ def draw_plan(image: np.ndarray, config: ForwardModelConfig, plan: Plan, gripper
     :param plan: visual_mpc.Plan.
     :param gripper: (4,) m, opening: where the plan begins.
     :param targets: (K, 2) (u, v), where the objects shall be.
+    :param sharp: the picture before it was made smaller, which people see better; or None.
     :return: uint8 (H * scale, W * scale, 3), enlarged: the elites' ways thin, the chosen one bold,
         the gripper a dot, the targets crosses in OBJECT_COLOURS.
     """
     scale = max(min(SCALE, LARGEST // image.shape[1]), 1)
     canvas = enlarge(image, scale)
+    if sharp is not None and len(sharp) > len(image):
+        canvas = np.asarray(cv2.resize(sharp, canvas.shape[1::-1]))
 
     def seen(actions: np.ndarray) -> np.ndarray:
         """Return where actions lead, (N + 1, 2) in fractions of the canvas' pixels, for cv2."""

@@ -3,7 +3,6 @@
 """Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from rclpy.node import Node
@@ -19,14 +18,13 @@ from tap_ros.base.contract import (
 from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.base.text import escaped
 from tap_ros.planning.action_sequences import Limits
-from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
+from tap_ros.planning.mpc_config import PRESETS, SWITCHES, with_preset
 from tap_ros.planning.reach import ReachConfig
 from tap_ros.planning.visual_mpc import Scene, VisualMPC
 from tap_ros.ros.parameters import check_device, Parameters, setting
-from tap_ros.weights import FORWARD_MODEL, PREDICTORS
+from tap_ros.weights import find_forward_model, FORWARD_MODELS
 
 MODES = ('subgoal', 'direct')
-SHIPPED = ', '.join(('push', *PLANNING_TASKS))
 MAX_BUDGET = 1000
 MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
 
@@ -46,7 +44,8 @@ class PlannerParameters:
     :param command_frame: Frame of the commands, for their header.
     :param max_step_xy: Largest |dx| and |dy| of a command in metres, 0.32 m/s at most; the planner
         knows it, from the next goal on.
-    :param max_step_z: Largest |dz| of a command in metres, 0.6 m/s at most; likewise.
+    :param max_step_z: Largest |dz| of a command in metres, 0.6 m/s at most; the planner
+        knows it, from the next goal on.
     :param goal_tolerance: A goal is reached at this mean distance of the objects in pixels, a
         subgoal where the mean expected distance to its maps is so much above the least possible.
     :param switch: When to go on from a subgoal: when it is reached, or its share of the budget
@@ -87,24 +86,13 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare_shared(
         'autostart', 'device', 'image_transport', 'robot_mask', 'joint_prefix', 'control_period')
     parameters.declare('weights', 'push',
-                       f'A forward model: the shipped one, by its name or a task ({SHIPPED}), or '
-                       'a file (.safetensors). Can be changed while the node is unconfigured.',
+                       'A forward model: the shipped one, by its name or a task '
+                       f'({", ".join(FORWARD_MODELS)}), or a file (.safetensors). Can be '
+                       'changed while the node is unconfigured.',
                        read_only=False)
     parameters.declare_fields(PlannerParameters)
     parameters.declare_arm()
     return parameters
-
-
-def weights_file(weights: str) -> Path:
-    """
-    Return the file that the parameter weights names; a file named so can be given as './push2'.
-
-    :raises ConfigError: for the name of weights that are no forward model.
-    """
-    if weights in PREDICTORS and weights not in PLANNING_TASKS:
-        raise ConfigError(f'parameter weights: {weights} is a subgoal predictor, for '
-                          f'predictor_node; expected a forward model: a file, or {SHIPPED}')
-    return FORWARD_MODEL if weights in ('push', *PLANNING_TASKS) else Path(weights)
 
 
 def load_planner(parameters: Parameters) -> VisualMPC:
@@ -119,7 +107,7 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     config = with_preset(
         parameters['preset'], solver=parameters['solver'],
         arm_hidden=parameters['arm_hidden'] or parameters['robot_mask'] == 'all')
-    mpc = VisualMPC.load(weights_file(parameters['weights']), config, parameters['device'])
+    mpc = VisualMPC.load(find_forward_model(parameters['weights']), config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
     scene = Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels)

@@ -3,9 +3,10 @@
 """
 Import a LeRobotDataset of version 2 or 3 as recordings.
 
-Pictures of one camera or several, the task as text, and where subtasks end, as marks. Actions,
-states and objects only of sets that have ours: four numbers called dx, dy, dz and opening, and so
-on; of other robots they would be an arm's command with another meaning, and are kept as signals.
+Pictures of one camera or several, the task as text, and where the next subtask begins, as marks.
+Actions, states and objects only of sets that have ours: four numbers called dx, dy, dz and
+opening, and so on; of other robots they would be an arm's command with another meaning, and are
+kept as signals.
 
 In such a set meta/info.json describes it, and meta/episodes has a row an episode (v2: a line of
 episodes.jsonl), data a row a frame. Pictures are files in the rows, or videos, of several episodes
@@ -98,7 +99,7 @@ def run(args: Options) -> None:
         path = beside(args.out)
         write_marks(path, open_recordings([args.out]), [args.out], {
             i: [(t, t) for t in frames] for i, frames in enumerate(data.marks) if frames})
-        print(f'{escaped(path)}: marks where subtasks end, of '
+        print(f'{escaped(path)}: marks where the next subtask begins, of '
               f'{sum(map(bool, data.marks))} episodes')
     if data.signals:
         print(f'signals: {listing(data.signals)}: {sum(map(len, data.signals.values()))} numbers')
@@ -118,7 +119,7 @@ class DataSet:
     :ivar signals: names of the numbers of each feature that is kept as signals.
     :ivar unused: features that are not taken over.
     :ivar skipped: what could not be used so far.
-    :ivar marks: of each episode so far the last frame of each subtask but the last one.
+    :ivar marks: of each episode so far the first frame of each subtask but the first one.
     :raises RecordingError: when it is none, or damaged.
     :raises ConfigError: for a camera that it has not, or has not alone.
     """
@@ -285,8 +286,8 @@ class DataSet:
         outcome = row.get(OUTCOME, '')
         self.marks.append([])
         if SUBTASK in self.features:
-            ends = np.flatnonzero(np.diff(np.ravel(listed(part[SUBTASK]))[kept]))
-            self.marks[-1] = ends[ends > 0].tolist()
+            begun = 1 + np.flatnonzero(np.diff(np.ravel(listed(part[SUBTASK]))[kept]))
+            self.marks[-1] = begun[begun < T - 1].tolist()  # the goal is no moment before it
         episode = make_episode(
             frames, seconds[kept], self._objects,
             task=row['tasks'], seed=int(row.get(SEED, row['episode_index'])),

@@ -19,6 +19,7 @@ import numpy as np
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.files import storage_errors
 from tap_ros.base.options import Bags, File, Folder
+from tap_ros.base.progress import Progress
 from tap_ros.base.text import escaped
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
@@ -40,7 +41,6 @@ from tap_ros.recording.formats.lerobot_format import (
 from tap_ros.recording.marks import Mark, read_marks
 from tap_ros.recording.reading import reading_of, ReadingOptions
 from tap_ros.robots.arm import DEFAULT_ARM
-from tqdm import tqdm
 
 EPISODES_PER_FILE = 100
 FILES_PER_CHUNK = 1000
@@ -57,7 +57,7 @@ class Options:
 
     :param recordings: bag folders, folders of bag folders, or .mcap files.
     :param out: folder of the data set; must not exist.
-    :param marks: file of marks (see `mark`); each ends a subtask.
+    :param marks: file of marks (see `mark`); with each the next subtask begins.
     """
 
     recordings: Bags
@@ -96,7 +96,7 @@ def export(store: EpisodeStore, folder: Path,
 
     :param store: EpisodeStore.
     :param folder: a new one.
-    :param marks: of episodes; the middle of each is the last frame of a subtask.
+    :param marks: of episodes; the middle of each is the first frame of the next subtask.
     :return: its features, as in info.json.
     :raises RecordingError: when frames lack what LeRobot needs.
     """
@@ -116,8 +116,8 @@ def export(store: EpisodeStore, folder: Path,
         names['subtask'], numbers[SUBTASK] = _subtasks(store, marks)
     features = _features(store, vectors)
     features |= {f'{key}_index': INDEX for key in names}
-    rows = list(tqdm(_write_files(store, folder, numbers), 'exporting', len(store),
-                     unit='episode', delay=1))
+    rows = list(Progress(_write_files(store, folder, numbers), 'exporting', len(store),
+                         unit='episode', delay=1))
     _write_meta(folder, features, names, rows, fps)
     _write_json(folder / 'meta/stats.json', {
         CAMERA: _picture_summary(store),
@@ -161,9 +161,9 @@ def _subtasks(store: EpisodeStore,
     names = [*(f'to mark {k + 1}' for k in range(most)), 'to the goal', 'not marked']
     found = []
     for i, T in enumerate(store.lengths.tolist()):
-        ends = [(first + last) // 2 for first, last in marks.get(i, ())]
-        passed = np.searchsorted(ends, np.arange(T))
-        passed[passed == len(ends)] = most if ends else most + 1
+        at = [(first + last) // 2 for first, last in marks.get(i, ())]
+        passed = np.searchsorted(at, np.arange(T), side='right')
+        passed[passed == len(at)] = most if at else most + 1
         found.append(passed)
     return {name: number for number, name in enumerate(names)}, np.concatenate(found)
 

@@ -140,8 +140,9 @@ def _with_subtasks(path: Path, part: BinaryIO, given: Mapping[int, Ends],
                         raise ConfigError(f'episode {episode} of the data set has no labels')
                     mine = episodes == episode
                     lengths[episode] = max(lengths.get(episode, 0.0), float(times[mine].max()))
-                    # A subtask ends with its last row.
-                    found[mine] = np.searchsorted(given[episode].ends, times[mine] - 1e-4)
+                    # The row at a moment is the first of the next subtask, as in the MCAP file.
+                    found[mine] = np.searchsorted(
+                        given[episode].ends, times[mine] + 1e-4, side='right')
                 columns = [batch[name] for name in schema.names if name != SUBTASK]
                 writer.write_batch(pyarrow.RecordBatch.from_arrays(
                     [*columns, pyarrow.array(found)], schema=schema))

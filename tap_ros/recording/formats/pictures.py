@@ -22,6 +22,7 @@ import numpy as np
 from tap_ros.base.errors import ConfigError, ImageError, RecordingError, RecordingWarning
 from tap_ros.base.files import only_writer
 from tap_ros.base.options import default_text, Folder
+from tap_ros.base.progress import Progress
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.recording.bags import VIDEOS, what_is
@@ -32,7 +33,6 @@ from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading import Part
 from tap_ros.recording.trust import inside, MOST_BYTES, MOST_FRAMES, regular
 from tap_ros.recording.writer import EpisodeWriter, Views, write_metadata
-from tqdm import tqdm
 from tyro import conf
 
 EPISODES_PER_FILE = 25
@@ -292,7 +292,7 @@ def write_bag(target: Target, episodes: Iterable[Episode | tuple[Episode, Views]
             for old in out.iterdir():
                 old.unlink()  # of an import that was killed
             with ExitStack() as stack:
-                for each in tqdm(episodes, 'importing', count, unit='episode', delay=1):
+                for each in Progress(episodes, 'importing', count, unit='episode', delay=1):
                     episode, views = each if isinstance(each, tuple) else (each, None)
                     if done % EPISODES_PER_FILE == 0:
                         stack.close()

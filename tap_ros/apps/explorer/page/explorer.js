@@ -2,40 +2,52 @@
 // SPDX-License-Identifier: Apache-2.0
 'use strict';
 
-const LEVELS = ['OK', 'WARN', 'ERROR', 'STALE'];
+// The connection, and the steps that lead from a scene to an arm that moves.
+
 const RECONNECT_MS = 1000;
+const STEPS = ['scene', 'objects', 'goal', 'predict', 'go'];
+const VIEW = {scene: 'camera', objects: 'camera', goal: 'goal', predict: 'goal', go: 'subgoal'};  // which a step begins with
 
 let socket = null;
-let problems = null;  // how many this page has shown
+let events = [];  // what happened
+let waiting = -1;  // for an answer: how many events there were before it
+let step = '';  // that is to be done
 
 function connect() {
   socket = new WebSocket(
     `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/socket${location.search}`);
   socket.binaryType = 'arraybuffer';
-  socket.onopen = () => show('link', 'connected', 'good');
   socket.onclose = () => {
-    show('link', 'no connection; trying again', 'bad');
-    enable(false);
+    showRun('no connection; trying again', 'bad');
+    if (state) showState();
     setTimeout(connect, RECONNECT_MS);
   };
   socket.onmessage = ({data}) => {
-    if (typeof data === 'string') {
-      take(JSON.parse(data));
-    } else {
-      takePicture(new Uint8Array(data));
-    }
+    if (typeof data === 'string') take(JSON.parse(data));
+    else takePicture(new Uint8Array(data));
   };
 }
 
+const connected = () => socket.readyState === WebSocket.OPEN;
+
 function take(message) {
   if (message.kind === 'state') {
+    const before = state;
     state = message;
-    if (problems !== null && message.problem.count > problems) showError(message.problem.text);
-    problems = message.problem.count;
+    if (before?.scene !== state.scene) {
+      $('seed').value = state.seed ?? 7;
+      step = '';
+      select(false);
+    }
+    if (before && state.problem.count > before.problem.count) showError(state.problem.text);
+    else if (before && state.events !== before.events) $('error').textContent = '';  // it went on
     if (moved && JSON.stringify(state.goal.objects) !== moved.until) moved = null;
     showState();
   } else if (message.kind === 'selection') {
     takeSelection(message);
+  } else if (message.kind === 'events') {
+    events = message.events;
+    showEvents();
   } else if (message.kind === 'error') {
     showError(message.text);
   }
@@ -43,144 +55,188 @@ function take(message) {
 
 function send(command) {
   $('error').textContent = '';
-  if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(command));
+  if (!connected()) {
+    showError('There is no connection; a goal in progress goes on until its end.');
+    return;
+  }
+  socket.send(JSON.stringify(command));
+  waiting = command.do === 'cancel' ? -1 : state?.events;
+  if (state) showState();
 }
 
 function showError(text) {
   $('error').textContent = text;
+  waiting = -1;
   moved = null;
-  drawAll();
+  asked = false;
+  if (state) showState();
 }
 
-function show(id, text, mark = '') {
-  $(id).textContent = text;
-  $(id).className = `pill ${mark}`;
+function showRun(text, mark) {
+  $('run').textContent = $('run').title = text;
+  $('run').className = mark;
 }
 
-function enable(connected) {
-  const running = !connected || state.run.running;
-  for (const id of ['predict', 'photograph', 'select', 'propose', 'follow']) {
-    $(id).disabled = !connected;
-  }
-  $('direct').disabled = running || !state.plans;
-  $('subgoal-run').disabled = running || !state.plans || !state.goal.pictured;
-  $('scene').querySelector('button').disabled = running || !state.simulator;
-  $('cancel').disabled = !connected || !state.run.running;
+/* How far each step is: [whether it is done, that in words, why it cannot be done yet]. */
+function progress() {
+  const {camera, goal, run, tracker, simulator} = state;
+  const count = camera.objects.length, missing = missingGoals();
+  const camera_why = !camera.width ? 'waits for the camera' : camera.note && `the camera is ${camera.note}`;
+  const goal_why = goal.pictured ? '' : 'needs a goal picture: step 3';
+  const predict_why = camera_why || goal_why || (!state.predictor && 'needs the predictor, which does not run');
+  const go_why = !state.plans ? `nothing plans how to grasp: for ${state.task} subgoals are predicted only`
+    : camera_why || (!count && 'needs objects: step 2') || (missing.length && `needs the goal of ${missing.join(', ')}: step 3`)
+    || (!state.planner && 'needs the planner, which does not run');
+  const clicked = clicks.length ? `${clicks.length} clicked; when all are, follow` : 'waits for objects: click on them';
+  const unsure = camera.objects.filter((one) => ['unsure', 'lost'].includes(one.state)).map(({name}) => name);
+  return {
+    scene: [!camera_why, camera_why || (!simulator ? `${camera.width}x${camera.height} pixels`
+      : state.seed === null ? state.task : `${state.task}, seed ${state.seed}`)],
+    objects: [count > 0 && !anew, selecting() ? clicked : !count ? 'waits for objects'
+      : unsure.length ? `not sure of ${unsure.join(', ')}` : tracker ? `${count} followed` : `${count} known`, camera_why],
+    goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
+      ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
+      : count && missing.length ? `drag ${missing.join(', ')} to its goal` : goal.pictured ? 'the picture is there' : 'placed by hand',
+    camera_why],
+    predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : predict_why || 'ready', predict_why],
+    go: [run.reached, run.running ? run.stage : run.end || go_why || 'ready', go_why]};
 }
 
 function showState() {
-  const {run, goal, camera} = state;
-  show('run', run.running ? run.stage || 'starting' : 'idle', run.running ? 'busy' : '');
-  enable(true);
-  $('camera-note').textContent = camera.note;
-  $('goal-note').textContent = goal.pictured ? '' : 'none yet';
+  const {run, goal} = state, done = progress(), on = connected();
+  if (on && run.running) showRun(run.stage.split(', plan')[0] || 'starting', 'busy');
+  else if (on) showRun(done.scene[0] ? 'the arm stands still' : done.scene[1], done.scene[0] ? 'good' : '');
+  document.body.classList.toggle('running', on && run.running);
+  lead(run.running || run.reached ? 'go' : STEPS.find((one) => !done[one][0]) ?? 'go', run.running || run.end);
+  for (const one of STEPS) {
+    const item = $(`step-${one}`);
+    item.classList.toggle('done', Boolean(done[one][0]));
+    item.querySelector('span').textContent = done[one][1];
+  }
+  // What cannot work yet cannot be pressed.
+  const busy = !on ? 'there is no connection' : run.running ? 'a goal is in progress' : '';
+  for (const id of ['task', 'seed', 'start', 'another']) allow(id, busy);
+  allow('propose', busy || done.objects[2] || (!goal.pictured && 'needs a goal picture'),
+    'what differs between the picture of now and the goal');
+  allow('follow', busy || done.objects[2] || (!clicks.length && 'click on the objects first'));
+  allow('again', busy);
+  allow('photograph', busy || done.goal[2]);
+  allow('predict', busy || done.predict[2]);
+  allow('direct', busy || done.go[2], 'to the goal at once');
+  allow('subgoal-run', busy || done.go[2] || done.predict[2], 'first to a predicted subgoal');
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
-  $('select').hidden = !state.tracker;
-  if (!state.tracker) choose(false);
-  $('observer-figure').hidden = !state.observer;
-  showLarge();
-  for (const kind of ['camera', 'goal']) {
-    $(kind).className = kind === 'camera' && selecting ? 'click'
-      : state.movable === kind ? 'drag' : '';
-  }
-  $('camera-hint').textContent = cameraHint();
-  $('goal-hint').textContent = goalHint();
-  $('plan-hint').textContent = state.plans
-    ? 'Ways of the fingertips that the planner considered; bold: the chosen one.'
-    : `Nothing plans how to grasp: for ${state.task} subgoals are predicted only.`;
-  if (state.tasks.join() !== [...$('task').options].map((o) => o.value).join()) {
-    $('task').replaceChildren(...state.tasks.map((task) => new Option(task, task)));
+  $('propose').hidden = $('follow').hidden = !selecting();
+  $('again').hidden = !state.tracker || (selecting() && !anew);
+  $('again').textContent = anew ? 'keep those before' : 'click others';
+  $('follow').textContent = clicks.length > 1 ? `follow these ${clicks.length}` : 'follow';
+  $('view-observer').parentElement.hidden = !state.observer;
+  if (state.tasks.join() !== [...$('task').options].map((one) => one.value).join()) {
+    fill($('task'), state.tasks, (task) => new Option(task, task));
     $('task').value = '';
   }
   if (!$('task').value) $('task').value = state.task || state.tasks[0];
-  const known = camera.objects.filter((one) => one.state);
-  $('states').hidden = !known.length;
-  fill($('states'), known, (one) => {
-    const item = document.createElement('li');
-    item.className = one.state;
-    item.append(mark(colourOf(one.name)), `${one.name}: ${STATES[one.state]}, `
-      + `${Math.round(100 * one.confidence)} %`);
-    return item;
-  });
-  fill($('diagnostics'), byNode(state.diagnostics), ([name, parts]) => {
-    const row = document.createElement('tr');
-    const level = Math.max(...parts.map((part) => part.level));
-    const wrong = parts.filter((part) => part.level > 0)
-      .map((part) => `${part.what}: ${part.message}`);
-    for (const text of [name, LEVELS[level] ?? '?', wrong.join('; ')]) {
-      row.insertCell().textContent = text;
-    }
-    return row;
-  });
-  fill($('log'), [...state.log].reverse(), (text) => {
-    const line = document.createElement('li');
-    line.textContent = text;
-    return line;
-  });
-  $('log').start = state.log_count;
-  drawAll();
+  listObjects();
+  const wrong = state.nodes.filter((one) => one.state === 'wrong').length;
+  $('nodes').className = wrong ? 'wrong' : '';
+  $('nodes').querySelector('span').textContent = wrong
+    ? `${wrong} of ${state.nodes.length} with a problem` : `all ${state.nodes.length} work`;
+  fill($('nodes').querySelector('tbody'), state.nodes, (one) => made('tr', {className: one.state},
+    made('td', {textContent: one.name}), made('td', {textContent: one.text})));
+  $('large').className = view === 'camera' && selecting() ? 'click' : movable() ? 'drag' : '';
+  $('large').ariaLabel = `${VIEWS[view][0]}${$('large').className && '; arrow keys move a cross, Enter '}`
+    + {click: 'marks an object', drag: 'takes and drops an object'}[$('large').className];
+  $('hint').textContent = state.events === waiting ? 'Asked; the answer will come.' : pictures[view] ? hint() : '';
+  draw();
 }
 
-function cameraHint() {
-  if (selecting) return 'Click the middle of each object, name it below, then press follow.';
-  if (state.movable === 'camera') return 'Drag each object to where it should be.';
-  if (state.tracker && !state.camera.objects.length) {
-    return 'Nothing is followed yet: press "select objects" and click each one.';
+/* Goes to the step that is to be done, once; moves: whether the arm moves there, or has. */
+function lead(now, moves) {
+  const at = `${now} ${moves}`;
+  if (at === step) return;
+  step = at;
+  for (const one of STEPS) {
+    if (one === now) $(`step-${one}`).ariaCurrent = 'step';
+    else $(`step-${one}`).removeAttribute('aria-current');
   }
-  return 'Circles: where objects are. Crosses: where they should be.';
+  open(now, moves);
 }
 
-function goalHint() {
-  if (!state.goal.pictured) {
-    return state.simulator ? 'No goal picture yet.'
-      : 'Arrange the objects and press "photograph the goal"'
-        + (state.tracker ? ', or drag them in the camera picture.' : '.');
-  }
-  const missing = missingGoals().map(({name}) => name);
-  if (missing.length && state.movable) {
-    return `Not found here: ${missing.join(', ')}. Drag each to where this picture shows it.`;
-  }
-  return state.movable === 'goal'
-    ? 'Drag an object to where it should be.' : 'The goal of the planner.';
+/* Shows a step's controls, where there is no room for all, and the picture that it is about. */
+function open(one, moves = state.run.end) {
+  for (const other of STEPS) $(`step-${other}`).classList.toggle('open', other === one);
+  look((moves && one === 'go') || !pictures[VIEW[one]] ? 'camera' : VIEW[one]);
 }
 
-function byNode(diagnostics) {
-  const nodes = new Map();
-  for (const {name, level, message} of diagnostics) {
-    const [node, what] = name.split(': ', 2);
-    if (!nodes.has(node)) nodes.set(node, []);
-    nodes.get(node).push({what, level, message});
+function hint() {
+  if (view === 'camera' && selecting()) {
+    return clicks.length ? 'Click the middle of the next object, or press "follow".'
+      : state.simulator || state.goal.pictured ? 'Click the middle of each object that is to be moved.'
+        : 'Photograph the objects where they are to be, put them back, then click the middle of each.';
   }
-  return [...nodes];
+  const missing = missingGoals(), moves = movable();
+  return {
+    camera: `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
+    goal: moves && missing.length ? `Not found in this picture: ${missing.join(', ')}. Drag each to where it shows it.`
+      : `What the table is to look like.${moves ? ' Drag an object to change that.' : ''}`,
+    subgoal: 'The predicted picture in between: each object glows where it is expected then.',
+    plan: 'Ways of the fingertips that the planner considered; bold: the chosen one.',
+    observer: "The camera's view, with the whole arm."}[view];
+}
+
+function showEvents() {
+  if (!events.length) return;
+  fill($('log'), [...events].reverse(), ({text, time, picture, problem}) => made('li', {className: picture ? '' : 'wide', title: text},
+    ...picture ? [made('img', {src: picture, alt: ''})] : [],
+    made('time', {textContent: new Date(1000 * time).toLocaleTimeString()}),
+    made('div', {className: problem ? 'bad' : '', textContent: text})));
+  $('log').scrollLeft = 0;
 }
 
 // Buttons and keys
 
+function begin() {
+  send({do: 'reset', task: $('task').value, seed: Math.max(0, Math.round(Number($('seed').value)))});
+}
+
+function on(id, command) {
+  $(id).addEventListener('click', () => send(command));
+}
+
 $('scene').addEventListener('submit', (event) => {
   event.preventDefault();
-  send({do: 'reset', task: $('task').value, seed: Math.max(0, Math.round(Number($('seed').value)))});
+  begin();
 });
-$('predict').addEventListener('click', () => send({do: 'predict'}));
-$('direct').addEventListener('click', () => send({do: 'reach', mode: 'direct'}));
-$('subgoal-run').addEventListener('click', () => send({do: 'reach', mode: 'subgoal'}));
-$('cancel').addEventListener('click', () => send({do: 'cancel'}));
-$('photograph').addEventListener('click', () => send({do: 'photograph'}));
-$('select').addEventListener('click', () => choose(!selecting));
-$('propose').addEventListener('click', () => propose());
+$('another').addEventListener('click', () => {
+  $('seed').value = Math.floor(1e6 * Math.random());
+  begin();
+});
+$('propose').addEventListener('click', () => {
+  send({do: 'propose'});
+  asked = true;
+});
 $('selection').addEventListener('submit', (event) => {
   event.preventDefault();
-  follow();
+  send({do: 'select', objects: clicks.map(({name, u, v}) => ({name, u, v}))});
 });
+$('again').addEventListener('click', () => select(!anew));
+on('photograph', {do: 'photograph'});
+on('predict', {do: 'predict'});
+on('direct', {do: 'reach', mode: 'direct'});
+on('subgoal-run', {do: 'reach', mode: 'subgoal'});
+on('cancel', {do: 'cancel'});
+for (const one of STEPS) $(`step-${one}`).querySelector('button').addEventListener('click', () => open(one));
 document.addEventListener('keydown', (event) => {
   if (event.key !== 'Escape' || !state) return;
   if (drag) {
     drop();
   } else if (state.run.running) {
     send({do: 'cancel'});
-  } else {
-    choose(false);
+  } else if (anew) {
+    select(false);
   }
 });
 
+$('log').append(made('li', {className: 'wide soft'}, 'Nothing yet: each step leaves its time, its words and a picture here.'));
+for (const one of document.querySelectorAll('#side .row button')) one.disabled = true;
 connect();

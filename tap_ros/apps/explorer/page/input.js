@@ -2,77 +2,61 @@
 // SPDX-License-Identifier: Apache-2.0
 'use strict';
 
-// What pointer and keys do to the pictures: objects to follow, and their goals.
+// What pointer and keys do to the large picture: objects to follow, and their goals.
 
 const NEAR = 0.08;  // share of the picture's width within which a press takes an object
 const STEP = 0.005, LEAP = 0.05;  // shares by which an arrow key moves the cursor
 
 let selections = null;  // number of the newest selection that came
 let asked = false;  // for proposals
+let anew = false;  // others than those that are followed are wanted
+let listed = false;  // whether the list is of clicks
 
 // Objects to follow
+
+const selecting = () => Boolean(state) && state.tracker && !state.run.running && (anew || !state.camera.objects.length);
 
 function takeSelection({count, followed, objects}) {
   const fresh = selections !== null && count !== selections;
   selections = count;
   if (followed) {
     outlines = Object.fromEntries(objects.map(({name, outline}) => [name, outline]));
-    if (fresh && count) choose(false);
+    if (fresh) select(false);
   } else if (fresh && asked) {
     asked = false;
     const near = NEAR * state.camera.width;  // what was clicked already stays
     for (const one of objects) {
       if (clicks.every(({u, v}) => Math.hypot(u - one.u, v - one.v) > near)) addClick(one);
     }
-    if (!objects.length) showError('Nothing differs from the goal picture; click each object.');
   }
-  if (state) drawAll();
-}
-
-function choose(on) {
-  if (on === selecting) return;
-  selecting = on;
-  clicks = [];
-  large = '';
-  $('select').setAttribute('aria-pressed', on);
-  $('selection').hidden = !on;
-  showClicks();
   if (state) showState();
 }
 
-function propose() {
-  asked = true;
-  send({do: 'propose'});
-}
-
-function follow() {
-  if (clicks.length) {
-    send({do: 'select', objects: clicks.map(({name, u, v}) => ({name, u, v}))});
-  } else {
-    showError('Click each object in the camera picture first.');
-  }
+/* Begins with no click; `again`: although objects are followed. */
+function select(again) {
+  anew = again;
+  clicks = [];
+  showClicks();
+  if (again) look('camera');
 }
 
 function showClicks() {
-  fill($('clicks'), clicks, (one, k) => {
-    const item = document.createElement('li');
-    const name = document.createElement('input');
-    name.value = one.name;
-    name.maxLength = 40;
-    name.setAttribute('aria-label', `name of object ${k + 1}`);
-    name.addEventListener('input', () => { one.name = name.value.trim(); });
-    const remove = document.createElement('button');
-    remove.type = 'button';
-    remove.textContent = '✕';
-    remove.title = 'do not follow this one';
-    remove.addEventListener('click', () => {
+  listed = false;
+  if (state) showState();
+}
+
+/* Lists clicks, whose names somebody may be writing, when they have changed; else what is seen. */
+function listObjects() {
+  if (selecting() && listed) return;
+  listed = selecting();
+  fill($('clicks'), listed ? clicks : state.camera.objects, (one, k) => made('li', {}, ...listed ? [mark(COLOURS[k % 4]),
+    made('input', {value: one.name, maxLength: 40, ariaLabel: `name of object ${k + 1}`,
+      oninput: (event) => { one.name = event.target.value.trim(); }}),
+    Object.assign(button('✕', () => {
       clicks.splice(k, 1);
       showClicks();
-    });
-    item.append(mark(COLOURS[k % 4]), name, remove);
-    return item;
-  });
-  if (state) draw('camera');
+    }), {title: 'do not follow this one', ariaLabel: `not ${one.name}`})]
+    : [mark(colourOf(one.name)), one.name + (one.state ? `: ${one.state}, ${Math.round(100 * one.confidence)} %` : '')]));
 }
 
 function addClick({u, v, outline}) {
@@ -85,30 +69,28 @@ function addClick({u, v, outline}) {
 
 // Pointer and keys
 
-function press(kind, at) {
-  if (kind === 'camera' && selecting) {
+function press(at) {
+  if (view === 'camera' && selecting()) {
     addClick(at);
-  } else if (state?.movable === kind && pictures[kind]) {
-    let best = NEAR * state[kind].width;
-    for (const {name, u, v} of kind === 'goal' ? goalPlaces() : targets()) {
+  } else if (movable()) {
+    let best = NEAR * state[view].width;
+    for (const {name, u, v} of draggable()) {
       const away = Math.hypot(u - at.u, v - at.v);
       if (away < best) {
         best = away;
-        drag = {kind, name, ...at};
+        drag = {name, ...at};
       }
     }
-    draw(kind);
+    draw();
   }
 }
 
-function shift(kind, at) {
-  if (drag) {
-    Object.assign(drag, at);
-    draw(kind);
-  }
+function shift(at) {
+  if (drag) Object.assign(drag, at);
+  draw();
 }
 
-function release(kind) {
+function release() {
   const {name, u, v} = drag;
   send({do: 'move', name, u, v});
   moved = {...drag, until: JSON.stringify(state.goal.objects)};
@@ -117,51 +99,43 @@ function release(kind) {
 
 function drop() {
   drag = null;
-  drawAll();
+  draw();
 }
 
-for (const kind of ['camera', 'goal']) {
-  const canvas = $(kind);
+{
+  const canvas = $('large');
   const pixelOf = (event) => {
-    const box = canvas.getBoundingClientRect();
-    return {u: (event.clientX - box.left) / box.width * state[kind].width - 0.5,
-            v: (event.clientY - box.top) / box.height * state[kind].height - 0.5};
+    const box = canvas.getBoundingClientRect(), {width, height} = state[view];
+    return {u: (event.clientX - box.left) / box.width * width - 0.5,
+            v: (event.clientY - box.top) / box.height * height - 0.5};
   };
   canvas.addEventListener('pointerdown', (event) => {
-    if (!state?.[kind].width) return;
-    press(kind, pixelOf(event));
+    if (!state?.[view]?.width) return;
+    press(pixelOf(event));
     if (drag) canvas.setPointerCapture(event.pointerId);
   });
-  canvas.addEventListener('pointermove', (event) => drag && shift(kind, pixelOf(event)));
-  canvas.addEventListener('pointerup', () => drag && release(kind));
+  canvas.addEventListener('pointermove', (event) => drag && shift(pixelOf(event)));
+  canvas.addEventListener('pointerup', () => drag && release());
   canvas.addEventListener('pointercancel', drop);
-  canvas.addEventListener('blur', () => draw(kind));
+  canvas.addEventListener('blur', draw);
   canvas.addEventListener('keydown', (event) => {
-    const size = state?.[kind];
+    const size = state?.[view];
     if (!size?.width) return;
-    if (cursor?.kind !== kind) cursor = {kind, u: size.width / 2, v: size.height / 2};
-    const arrow = {ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1]}[
-      event.key];
+    if (cursor?.kind !== view) cursor = {kind: view, u: size.width / 2, v: size.height / 2};
+    const arrow = {ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1]}[event.key];
     if (arrow) {
       const step = (event.shiftKey ? LEAP : STEP) * size.width;
       cursor.u = Math.min(Math.max(cursor.u + step * arrow[0], 0), size.width - 1);
       cursor.v = Math.min(Math.max(cursor.v + step * arrow[1], 0), size.height - 1);
-      shift(kind, {u: cursor.u, v: cursor.v});
+      shift({u: cursor.u, v: cursor.v});
     } else if (event.key === 'Enter' && drag) {
-      release(kind);
+      release();
     } else if (event.key === 'Enter') {
-      press(kind, {u: cursor.u, v: cursor.v});
+      press({u: cursor.u, v: cursor.v});
     } else {
       return;
     }
     event.preventDefault();
-    draw(kind);
-  });
-}
-for (const button of document.querySelectorAll('figcaption button')) {
-  const kind = button.closest('figure').querySelector('canvas').id;
-  button.addEventListener('click', () => {
-    large = large === kind ? '' : kind;
-    if (state) showLarge();
+    draw();
   });
 }

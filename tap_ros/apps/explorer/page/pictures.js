@@ -2,24 +2,28 @@
 // SPDX-License-Identifier: Apache-2.0
 'use strict';
 
-// Pictures, and what is drawn over them.
+// Pictures, of which one is large, and what is drawn over it.
 
 const COLOURS = ['#ffb000', '#648fff', '#dc267f', '#009e73'];  // as in tap_ros/images/drawing.py
-const STATES = {  // of an object that is followed
-  seen: 'seen', hidden: 'hidden', unsure: 'unsure', lost: 'lost, select it again'};
 const STATE_COLOURS = {seen: '#2fbf5b', hidden: '#9aa6b8', unsure: '#ff9f1c', lost: '#e5484d'};
 const SHARP = 1024;  // least width (px) to which a picture is drawn, each pixel a square
+const SMALL = 96;  // px, of the switches
+const VIEWS = {  // kind: [name, what will be there]
+  camera: ['now', 'What the camera sees will be here, once it sends a picture.'],
+  goal: ['goal', 'The goal picture will be here: what the table is to look like.'],
+  subgoal: ['subgoal', 'The predicted subgoal will be here, after step 4: the picture in '
+    + 'between, in which each object glows where it is expected.'],
+  plan: ['plan', 'The newest plan will be here, once the arm moves: the ways that were '
+    + 'considered, and the one that was chosen.'],
+  observer: ['arm', 'The whole arm will be here, as the camera would see it.']};
 
-const $ = (id) => document.getElementById(id);
-const fill = (parent, items, make) => parent.replaceChildren(...items.map(make));
 let state = null;
 const pictures = {};  // kind -> ImageBitmap
 const numbers = {};  // kind -> how many have come
+let view = 'camera';  // kind of the large picture
 let outlines = {};  // name -> outline of an object that is followed, relative to its pixel
-let selecting = false;
 let clicks = [];  // {name, u, v, outline} of objects to follow
-let large = '';  // kind of the picture that somebody wants large
-let drag = null;  // {kind, name, u, v} while an object is dragged
+let drag = null;  // {name, u, v} while an object is dragged
 let moved = null;  // the same after it, until the goal changes
 let cursor = null;  // {kind, u, v}, moved by keys
 
@@ -32,53 +36,54 @@ async function takePicture(bytes) {
   if (number !== numbers[kind]) return;  // a newer one was decoded sooner
   if (pictures[kind]) pictures[kind].close();
   pictures[kind] = bitmap;
-  if (!bitmap) $(kind).getContext('2d').reset();
-  draw(kind);
+  const small = $(`small-${kind}`), context = small.getContext('2d');
+  context.reset();
+  if (bitmap) {
+    small.height = Math.round(SMALL * bitmap.height / bitmap.width);
+    context.drawImage(bitmap, 0, 0, SMALL, small.height);
+  }
+  if (state) showState();
 }
 
-/* The picture that somebody chose is large, else that which is to be clicked, else the robot. */
-function showLarge() {
-  const wanted = large || (selecting || state.movable === 'camera' ? 'camera' : 'observer');
-  const kind = wanted === 'observer' && !state.observer ? 'camera' : wanted;
-  for (const figure of document.querySelectorAll('main figure')) {
-    figure.classList.toggle('large', figure.querySelector('canvas').id === kind);
-  }
+/* Shows a picture large. */
+function look(kind) {
+  view = kind;
+  $(`view-${kind}`).checked = true;
+  drop();
+  if (state) showState();
+}
+
+for (const [kind, [name]] of Object.entries(VIEWS)) {
+  $('views').append(made('label', {},
+    made('input', {type: 'radio', name: 'view', id: `view-${kind}`, checked: kind === view, onchange: () => look(kind)}),
+    made('canvas', {id: `small-${kind}`, width: SMALL, height: SMALL}), name));
 }
 
 // Drawing, in pixels of the camera's picture, (0, 0) the centre of the first one
 
-function drawAll() {
-  for (const kind of ['camera', 'goal']) draw(kind);
-}
-
-function draw(kind) {
-  const context = paint(kind);
+function draw() {
+  const context = paint();
+  $('empty').textContent = context ? '' : VIEWS[view][1];
   if (!context || !state) return;
-  if (kind === 'camera' && selecting) {
+  if (view === 'camera' && selecting()) {
     clicks.forEach((one, k) => drawOutlined(context, one, COLOURS[k % 4], one.outline));
-  } else if (kind === 'camera') {
-    for (const one of state.camera.objects) {
-      drawOutlined(context, one, colourOf(one.name), outlines[one.name]);
-    }
+  } else if (view === 'camera') {
+    for (const one of state.camera.objects) drawOutlined(context, one, colourOf(one.name), outlines[one.name]);
     for (const one of state.camera.targets) cross(context, one, colourOf(one.name));
-    if (state.movable === 'camera') drawDragged(context, kind, targets());
-  } else if (kind === 'goal') {
+  } else if (view === 'goal') {
     const missing = missingGoals();
     for (const one of goalPlaces()) {
-      const known = missing.some(({name}) => name === one.name) ? 'lost' : '';
-      drawOutlined(context, {...one, state: known}, colourOf(one.name),
-        known && outlines[one.name]);
+      const known = missing.includes(one.name) ? 'lost' : '';
+      drawOutlined(context, {...one, state: known}, colourOf(one.name), known && outlines[one.name]);
     }
-    drawDragged(context, kind, goalPlaces());
   }
-  if (cursor?.kind === kind && document.activeElement === $(kind)) {
-    cross(context, cursor, '#fff', 0);
-  }
+  if (movable()) drawDragged(context);
+  if (cursor?.kind === view && document.activeElement === $('large')) cross(context, cursor, '#fff', 0);
 }
 
-function paint(kind) {
-  const canvas = $(kind);
-  const bitmap = pictures[kind];
+function paint() {
+  const canvas = $('large'), bitmap = pictures[view];
+  canvas.hidden = !bitmap;
   if (!bitmap) return null;
   const scale = Math.max(1, Math.round(SHARP / bitmap.width));
   if (canvas.width !== bitmap.width * scale || canvas.height !== bitmap.height * scale) {
@@ -89,7 +94,7 @@ function paint(kind) {
   context.setTransform(1, 0, 0, 1, 0, 0);
   context.imageSmoothingEnabled = false;
   context.drawImage(bitmap, 0, 0, canvas.width, canvas.height);
-  const size = kind === 'goal' ? state?.goal : state?.camera;
+  const size = view === 'goal' ? state?.goal : state?.camera;
   const unit = size?.width ? canvas.width / size.width : scale;
   context.setTransform(unit, 0, 0, unit, unit / 2, unit / 2);
   context.lineWidth = 2.5 / unit * (canvas.width / 550);
@@ -101,15 +106,8 @@ function colourOf(name) {
   return COLOURS[[...new Set(names)].indexOf(name) % 4];
 }
 
-function mark(colour) {
-  const item = document.createElement('i');
-  item.style.background = colour;
-  return item;
-}
-
-function radius(context) {
-  return context.canvas.width / context.getTransform().a * 0.035;
-}
+const mark = (colour) => made('i', {style: `background: ${colour}`});
+const radius = (context) => context.canvas.width / context.getTransform().a * 0.035;
 
 /* An outline moves with its object's pixel: it is not turned, and shows no angle. */
 function drawOutlined(context, {u, v, state: known}, colour, outline) {
@@ -143,9 +141,8 @@ function cross(context, {u, v}, colour, turn = 1) {
   context.stroke();
 }
 
-function drawDragged(context, kind, places) {
-  const held = drag ?? moved;
-  const from = held?.kind === kind && places.find(({name}) => name === held.name);
+function drawDragged(context) {
+  const held = drag ?? moved, from = held && draggable().find(({name}) => name === held.name);
   if (!from) return;
   drawOutlined(context, held, colourOf(held.name), outlines[held.name]);
   context.beginPath();
@@ -157,21 +154,20 @@ function drawDragged(context, kind, places) {
 
 // Goals
 
-/* Followed objects that have no goal, or were not found in the goal picture. */
+/* Names of objects that have no goal, or were not found in the goal picture. */
 function missingGoals() {
   const known = state.goal.objects.filter((one) => one.state !== 'lost').map(({name}) => name);
-  return state.camera.objects.filter(({name}) => !known.includes(name));
+  return state.camera.objects.map(({name}) => name).filter((name) => !known.includes(name));
 }
 
 /* What is shown and dragged in the goal picture; what has no goal begins where it is now. */
 function goalPlaces() {
   const names = state.goal.objects.map(({name}) => name);
-  return [...state.goal.objects,
-    ...state.camera.objects.filter(({name}) => !names.includes(name))];
+  return [...state.goal.objects, ...state.camera.objects.filter(({name}) => !names.includes(name))];
 }
 
-/* What can be dragged in the camera's picture: goals, and objects that have none yet. */
-function targets() {
-  const {objects, targets: goals} = state.camera;
-  return objects.map((one) => goals.find(({name}) => name === one.name) ?? one);
-}
+/* What can be dragged in the large picture: goals and, where they are seen, objects. */
+const draggable = () => view === 'goal' ? goalPlaces() : [...state.camera.targets, ...state.camera.objects];
+
+/* Whether goals can be dragged in the large picture. */
+const movable = () => Boolean(state?.movable) && !selecting() && (view === 'goal' ? state.movable === 'goal' : view === 'camera');

@@ -1,0 +1,176 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One scene of a loop that another world judges, by each of the methods that are compared."""
+
+from functools import lru_cache
+import io
+from pathlib import Path
+from typing import NamedTuple
+
+from experiments.planning.episode import run_episode
+from experiments.planning.methods import FIRST_SCENE, Method
+import numpy as np
+from PIL import Image
+from sim_bridge.metaworld import MetaWorld
+from sim_bridge.pushes import push_to_goal
+from tap_ros.base.contract import ACTION_LIMIT, step_budget
+from tap_ros.base.errors import SceneError
+from tap_ros.images.crop import trained_crop
+from tap_ros.images.drawing import enlarge
+from tap_ros.messages.subgoals import Subgoal
+from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.protocols import SearchConfig
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.prediction.nearest_keyframe import NearestKeyframe
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.protocol import Predictor
+from tap_ros.prediction.warp import one_hot_maps
+import torch
+
+IMAGE_SIZE = 64
+UNTRAINED = ('random', 'straight', 'around')  # methods that need nothing but the world
+PLANNED = ('direct', 'places', 'retrieval', 'fixed time', 'subgoal')
+WITH_WAYS = ('around', 'places')  # which something in the way makes different from others
+BUDGETS = {'push-wall-v3': 55}  # commands; else contract.step_budget
+# Half of what is usual, so that a plan takes half the time.
+PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threads=1)
+REACHED = 2.0  # px, here about cm: within this, the object is where it shall be
+DRAWN = 'direct', 'subgoal'
+FILM_SIZE, FRAME_MS, HOLD_MS = 256, 120, 3000  # pixels; of each picture, of the last one
+STRIPS = 6  # scenes of each task whose actions and subgoals are kept, to draw them
+SCALE = 2  # of pictures that are drawn
+
+
+class Weights(NamedTuple):
+    """What methods act by: files, '' for none."""
+
+    forward: str = ''
+    predictor: str = ''  # of this method
+    keyframes: str = ''  # recordings and their marks, as NearestKeyframe.load takes them
+
+
+class Judged(MetaWorld):
+    """Meta-World, and what it says after every step."""
+
+    def reset(self, seed):
+        """Begin a scene."""
+        self.said, self.actions = [], []
+        return super().reset(seed)
+
+    def step(self, action):
+        """Act, and note."""
+        seen = super().step(action)
+        self.said.append(self.succeeds())
+        self.actions.append(np.asarray(action))
+        return seen
+
+
+class Places(Predictor):
+    """
+    Subgoals that are put by hand: the object at the places by the way; the picture is the start.
+
+    :param world: whose `ways` they are, after a reset.
+    """
+
+    mode = 'bidirectional'
+
+    def __init__(self, world):
+        height = world.object_poses()[0, 2]
+        self.pixels = world.camera.project([(*way, height) for way in world.ways])[:, None]
+        self.image_size, self.training = (IMAGE_SIZE, IMAGE_SIZE), {}
+        self.camera_crop = trained_crop(self.training, self.image_size)
+
+    def predict_together(self, requests):
+        """Answer requests."""
+        return [[Subgoal(
+            request.start, one_hot_maps(torch.from_numpy(at), self.image_size).numpy(), at,
+            np.ones(1, np.float32), 0, len(self.pixels) - i)
+            for i, at in enumerate(self.pixels.astype(np.float32))] for request in requests]
+
+
+_world, _planner = lru_cache(Judged), lru_cache(VisualMPC.load)
+_predictor, _keyframes = lru_cache(SubgoalPredictor.load), lru_cache(NearestKeyframe.load)
+
+
+def run_scene(task, method, seed, weights, folder):
+    """Run a method in a scene; return what came of it, None if the scene has no goal."""
+    world = _world(task, IMAGE_SIZE)
+    try:
+        start, shown = _act(world, method, seed, weights)
+    except SceneError:
+        return None
+    kept = Path(folder, f'{method}_{seed}.npz')
+    if seed < FIRST_SCENE + STRIPS and not kept.exists():  # of the first training
+        np.savez(kept, actions=world.actions, shown=shown)
+    goal = world.goal().object_poses[0, :3] - world.goal_places()[0]
+    return {'task': task, 'method': method, 'seed': seed, 'ends': bool(world.succeeds()),
+            'ever': any(world.said), 'steps': len(world.said),
+            'goal_cm': _cm(np.linalg.norm(goal)), 'start_cm': _cm(start),
+            'final_cm': _cm(world.distances()[0])}
+
+
+def _cm(metres):
+    return round(100 * float(metres), 2)
+
+
+def _act(world, method, seed, weights):
+    """Act as long as a goal may take; return m at the start; pictures: start, subgoals, end."""
+    budget = BUDGETS.get(world.task_name, step_budget(1))
+    if method in PLANNED:
+        def predictor():
+            return {'places': lambda: Places(world), 'direct': lambda: None,
+                    'retrieval': lambda: _keyframes(weights.keyframes)}.get(
+                        method, lambda: _predictor(weights.predictor))()
+
+        if method == 'places':
+            world.reset(seed)
+        ran = run_episode(
+            world, _planner(weights.forward, PLANNER),
+            Method(method.replace(' ', '_'), recursion=max(1, len(world.ways))), budget, seed,
+            predictor(), REACHED)
+        frames = ran.frames
+        return ran.distances[0, 0], [
+            frames[0], *(subgoal.image for subgoal in ran.subgoals), frames[-1]]
+    last = first = world.reset(seed)
+    distance, rng = world.distances()[0], np.random.default_rng(seed)
+    actions = (np.append(rng.uniform(-1, 1, 3) * ACTION_LIMIT, 0) for _ in range(budget))
+    if method != 'random':
+        actions = push_to_goal(world, ways=world.ways if method == 'around' else ())
+    for _, action in zip(range(budget), actions):
+        last = world.step(action)
+    return distance, [first.image, last.image]
+
+
+def _kept(task, seed, folder):
+    """Return what is kept of a scene by the methods DRAWN; None where one is missing."""
+    paths = [Path(folder, f'{method}_{seed}.npz') for method in DRAWN]
+    return [np.load(path) for path in paths] if all(map(Path.exists, paths)) else None
+
+
+def draw_strip(task, seed, folder):
+    """
+    Draw a scene: where it ends directly; the start, what was predicted, the end; the goal.
+
+    :return: list of pictures, None if they are not kept.
+    """
+    kept = _kept(task, seed, folder)
+    if kept is None:
+        return None
+    world = _world(task, IMAGE_SIZE)
+    world.reset(seed)
+    direct, subgoal = (each['shown'] for each in kept)
+    return [enlarge(picture, SCALE) for picture in (direct[-1], *subgoal, world.goal().image)]
+
+
+def film(task, seed, folder):
+    """Return an animated WebP of a scene that is kept: left directly, right via the subgoals."""
+    world = _world(task, FILM_SIZE)
+    films = [[world.reset(seed).image, *(world.step(action).image for action in each['actions'])]
+             for each in _kept(task, seed, folder)]
+    length = max(map(len, films))
+    first, *others = (Image.fromarray(np.hstack([one[min(t, len(one) - 1)] for one in films]))
+                      for t in range(length))
+    buffer = io.BytesIO()
+    first.save(buffer, 'webp', save_all=True, append_images=others, loop=0, quality=80,
+               duration=[FRAME_MS] * (length - 1) + [HOLD_MS])
+    return buffer.getvalue()

@@ -1,0 +1,160 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the explorer's page beside a camera, in a real browser, at a desk and on a phone."""
+
+from browsing import chromium, hidden_or_over, needs_browser, opened
+from geometry_msgs.msg import Point32, Polygon
+import numpy as np
+from processes import Client, LocalNode, until
+import pytest
+from sensor_msgs.msg import Image
+from tap_msgs.msg import ObjectStates
+from tap_msgs.srv import SelectObjects
+from tap_ros.apps.explorer.node import ExplorerNode
+from tap_ros.base.contract import CAMERA_FRAME
+from tap_ros.ros.topics import encode_image, encode_objects, STREAM, to_stamp
+
+pytestmark = [pytest.mark.slow, needs_browser]
+WIDE, HIGH = 320, 240
+DESK, PHONE = (1280, 800), (390, 844)
+CUP, RING = (60.0, 80.0), (250.0, 190.0)
+LIVE = """() => [...document.querySelectorAll('button:enabled')].filter(
+    (one) => one.offsetParent && !one.closest('h2')).map((one) => one.id)"""
+
+
+class Camera:
+    """A camera, and a tracker of another make."""
+
+    def __init__(self, node):
+        self._pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
+        self._objects = node.create_publisher(ObjectStates, 'objects', STREAM)
+        self._image = np.full((HIGH, WIDE, 3), 90, np.uint8)
+        self._stamp, self.selected = 10**9, None
+        node.create_timer(0.1, self._send)
+        node.create_service(SelectObjects, 'select_objects', self._select)
+
+    def _send(self):
+        self._stamp += 10**8
+        self._pictures.publish(encode_image(self._image, to_stamp(self._stamp), CAMERA_FRAME))
+        if self.selected is not None:
+            message = self._encode()
+            message.states = ['seen', 'hidden'][:len(message.objects)]
+            message.confidence = [0.9] * len(message.objects)
+            self._objects.publish(message)
+
+    def _encode(self):
+        asked = self.selected
+        return encode_objects(asked.names, np.column_stack([asked.u, asked.v]), None,
+                              to_stamp(self._stamp), CAMERA_FRAME, ObjectStates.SOURCE_TRACKED)
+
+    def _select(self, request, response):
+        if 'thumb' in request.names:
+            response.message = 'thumb is on nothing; click on an object'
+            return response
+        self.selected, response.success = request, True
+        response.objects = self._encode().objects
+        response.outlines = [Polygon(points=[
+            Point32(x=u + du, y=v + dv) for du, dv in ((-9.0, -9.0), (9.0, -9.0), (0.0, 9.0))])
+            for u, v in zip(request.u, request.v)]
+        return response
+
+
+@pytest.fixture(scope='module')
+def browser():
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def explorer():
+    explorer = LocalNode(ExplorerNode, port=0)
+    yield explorer
+    assert explorer.end() == 0
+
+
+def at(page, u, v):
+    """Return where a pixel of the large picture is on the page."""
+    box = page.locator('#large').bounding_box()
+    return (box['x'] + (u + 0.5) / WIDE * box['width'],
+            box['y'] + (v + 0.5) / HIGH * box['height'])
+
+
+def says(page, step):
+    return page.inner_text(f'#step-{step} > span')
+
+
+@pytest.mark.parametrize(('size', 'scheme'), [(DESK, 'light'), (PHONE, 'dark')])
+def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_early(
+        explorer, browser, size, scheme):
+    with opened(browser, explorer.node.url, size, color_scheme=scheme) as page:
+        page.wait_for_function('state')
+        assert says(page, 'scene') == 'waits for the camera' and page.evaluate(LIVE) == ['cancel']
+        assert 'will be here' in page.inner_text('#empty') and page.is_hidden('#large')
+        for kind in ('goal', 'subgoal', 'plan'):
+            page.check(f'#view-{kind}', force=True)
+            assert 'will be here' in page.inner_text('#empty')
+        page.check('#view-camera', force=True)
+        assert not hidden_or_over(page, 'header', '#stage', '#said', '#views', '#steps')
+        with Client('camera') as node:
+            camera = Camera(node)
+            page.wait_for_function('pictures.camera && state.tracker')
+            page.wait_for_selector('#step-objects[aria-current=step]')
+            assert says(page, 'objects') == 'waits for objects: click on them'
+            assert says(page, 'go') == 'needs objects: step 2'
+            assert 'follow' not in page.evaluate(LIVE)
+            assert not hidden_or_over(page, '#stage', '#said', '#views', '#follow', '#cancel')
+            for place in (CUP, RING):
+                page.mouse.click(*at(page, *place))
+            assert not hidden_or_over(
+                page, '#stage', '#said', '#views', '#clicks', '#follow', '#cancel')
+            before = page.locator('#follow').bounding_box()
+            page.fill('#clicks li:last-child input', 'thumb')
+            page.click('#follow')
+            page.wait_for_selector('#error:not(:empty)')
+            assert page.inner_text('#error') == (
+                'not followed: thumb is on nothing; click on an object')
+            assert page.locator('#follow').bounding_box() == before, 'nothing moves'
+            page.fill('#clicks li:last-child input', 'ring')
+            page.click('#follow')
+            assert until(lambda: camera.selected is not None)
+            assert list(camera.selected.names) == ['object_0', 'ring']
+            clicked = np.column_stack([camera.selected.u, camera.selected.v])
+            assert np.abs(clicked - (CUP, RING)).max() < 1, 'pixels of the camera'
+            page.wait_for_selector('#step-goal[aria-current=step]')
+            assert says(page, 'objects') == '2 followed' and not page.inner_text('#error')
+            assert 'ring: hidden, 90 %' in page.inner_text('#clicks')
+            assert not hidden_or_over(page, '#stage', '#said', '#views', '#photograph', '#cancel')
+            page.click('#photograph')
+            page.wait_for_function('pictures.goal')
+            page.wait_for_function('events.length && events.at(-1).picture')
+            assert says(page, 'predict') == 'needs the predictor, which does not run'
+            assert not {'predict', 'direct', 'subgoal-run'} & {*page.evaluate(LIVE)}
+        page.wait_for_function("/silent/.test($('step-scene').textContent)")
+        assert 'photograph' not in page.evaluate(LIVE)
+
+
+def test_keys_and_a_screen_reader_reach_all_that_a_pointer_does(explorer, browser):
+    with opened(browser, explorer.node.url) as page, Client('camera') as node:
+        camera = Camera(node)
+        page.wait_for_function('pictures.camera && state.tracker')
+        page.focus('#large')
+        for key, times in (('Shift+ArrowLeft', 3), ('ArrowUp', 2), ('Enter', 1)):
+            for _ in range(times):
+                page.keyboard.press(key)
+        for _ in range(40):
+            if page.evaluate('document.activeElement.id') == 'follow':
+                break
+            page.keyboard.press('Tab')
+        page.keyboard.press('Enter')
+        assert until(lambda: camera.selected is not None)
+        assert np.allclose([camera.selected.u[0], camera.selected.v[0]],
+                           [WIDE / 2 - 0.15 * WIDE, HIGH / 2 - 0.01 * WIDE], atol=1)
+        page.wait_for_selector('#step-goal[aria-current=step]')
+        told = page.locator('body').aria_snapshot()
+        for name in ('application "now', 'radio "subgoal"', 'button "cancel"', 'status "',
+                     'list "objects"', 'list "What happened"', 'button "photograph the goal"'):
+            assert name in told, told
+        unnamed = page.evaluate("""() => [...document.querySelectorAll('button, input, select')]
+            .filter((one) => one.offsetParent && !(one.textContent || one.ariaLabel
+                || one.labels?.length)).map((one) => one.outerHTML)""")
+        assert not unnamed
