@@ -71,13 +71,13 @@ def run(args: Options) -> None:
     with Client(args.namespace, args.timeout) as client:
         fields = request_fields(
             **pictures, **{f'{name}_objects': places for name, places in pixels.items()})
-        while True:
+        response = None
+        while response is None:
             try:
                 response = client.call(
-                    'predict', max(0.1, deadline - time.monotonic()), **fields,
+                    'predict', max(1.0, deadline - time.monotonic()), **fields,
                     mode='' if args.mode == 'auto' else args.mode, num_samples=args.samples,
                     recursion_depth=args.recursion, seed=args.seed)
-                break
             except CallError as error:  # the first picture may be yet to come
                 if NOTHING_CAME not in str(error) or time.monotonic() > deadline:
                     raise

@@ -64,7 +64,8 @@ class Diagnostics:
 
     Status of the work: ERROR for ERROR_SECONDS after an error, else WARN with the reason while
     `idle` returns one, else OK.
-    Of each input: NotReceived (WARN), Stale (STALE) when a stream is older than STALE_S, or OK.
+    Of each input: NotReceived (WARN for what has to come, else OK), Stale (STALE) when a stream is
+    older than STALE_S, or OK.
 
     :param node: rclpy Node.
     :param streams: topics that come all the time, named as the node subscribes to them.
@@ -160,7 +161,9 @@ class Diagnostics:
         age, max_age_s = now - source.newest, self._max_age_s[topic]
         level, text = DiagnosticStatus.OK, 'OK'
         if not source.count:
-            level, text, age = DiagnosticStatus.WARN, 'NotReceived', math.nan
+            text, age = 'NotReceived', math.nan
+            if max_age_s < math.inf or topic in self._expected:
+                level = DiagnosticStatus.WARN
         elif age > max_age_s:
             level, text = DiagnosticStatus.STALE, 'Stale'
         return self._status(topic, level, text, {

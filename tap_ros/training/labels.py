@@ -30,7 +30,9 @@ RATE = 10.0  # Hz, at most, of the frames that may be labels
 MOTION_RATE = 5.0  # Hz, about, of the frames between which motion is described
 AROUND_S = (-0.6, -0.3, 0.0, 0.3, 0.6)  # of the frames that are described together
 REACH_S = (0.0, 0.3, 0.6)  # how far around a frame models look: of AROUND_S so many
-GREY = (0.0, 0.1, 0.3, 1.0)  # weights that the small grey picture has in models
+# Weights that the small grey picture has in models: of pixels in their deviations; and as they
+# are, so that one in which little happens says little.
+GREY, PLAIN_GREY = (0.0, 0.1, 0.3, 1.0), (0.3, 1.0, 2.0)
 LEAST_SHARE = 1e-3  # of a model that counts in the average
 RIDGE = 0.2  # price of the squared weights, in nats; features have variance 1
 SPREAD_S = 0.1  # a mark is off by so much as often as not
@@ -154,7 +156,7 @@ class MomentModel:
 
     :param films: that were marked.
     :param moments: of each (M,) s.
-    :param grey: weight of the small grey picture.
+    :param grey: weight of the small grey picture; below 0: of its pixels as they are.
     :param reach: s around a frame, of AROUND_S, that count.
     :param like: a model of nearly the same marks, from which the search for weights begins.
     :raises ConfigError: without marks, or where not all have as many.
@@ -167,7 +169,8 @@ class MomentModel:
                               'ten')
         everything = np.concatenate([one.features for one in films])
         self._mean, self._scale = everything.mean(0), 1 / np.maximum(everything.std(0), 1e-6)
-        self._scale[-films[0].grey:] *= grey
+        pixels = slice(-films[0].grey, None)
+        self._scale[pixels] = -grey if grey < 0 else grey * self._scale[pixels]
         self._scale[np.abs(films[0].around) > reach + 1e-6] = 0
         inputs = [self._inputs(one) for one in films]
         self._weights: np.ndarray = np.stack([
@@ -246,12 +249,12 @@ def fit(films: Sequence[Film],
     """
     if len(films) < 3:
         return MomentModel(films, moments, GREY[1]), []
-    models = [MomentModel(films, moments, grey, reach) for reach, grey in product(REACH_S, GREY)]
+    kinds = list(product((*GREY, *(-one for one in PLAIN_GREY)), REACH_S))
+    models = [MomentModel(films, moments, *kind) for kind in kinds]
     worth, others = np.empty((len(models), len(films))), list[list[MomentModel]]()
     for i, (one, marks) in enumerate(zip(films, moments)):
         rest = [*films[:i], *films[i + 1:]], [*moments[:i], *moments[i + 1:]]
-        others.append([MomentModel(*rest, grey, reach, like) for (reach, grey), like in zip(
-            product(REACH_S, GREY), models)])
+        others.append([MomentModel(*rest, *kind, like) for kind, like in zip(kinds, models)])
         near = np.abs(one.stamps - marks[:, None]) <= one.tolerance  # (M, T)
         for k, model in enumerate(others[-1]):
             right = (np.exp(model.log_posterior(one)) * near).sum(1)

@@ -5,6 +5,7 @@
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 import json
+from pathlib import Path
 import shlex
 import socket
 import threading
@@ -223,8 +224,15 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
     assert label == ['python', '-m', 'tap_ros', 'label', str(bag), '--marks', 'my marks.json',
                      '--out', 'labels/squares']
     assert train[3:] == ['train', 'predictor', str(bag), '--marks', 'my marks.json', '--rate',
-                         '4', '--crop', 'whole', '--size', '64', '--recursion', '2', '--out',
-                         'runs/squares']
+                         '4', '--crop', 'centre', '--size', '64', '--recursion', '2',
+                         '--test-fraction', '0.25', '--threads', '1', '--out', 'runs/squares']
+    one = Marking(store, [str(bag)], tmp_path / 'one.json', ['grasp'])
+    for i in range(2):
+        one.mark(i, [3])
+    page = (Path(__file__).parents[2] / 'docs/first_hour.md').read_text()
+    words = one.commands(['--crop', 'centre'])[1].replace(str(bag), 'bags/bottle').replace(
+        'one.json', 'bags/bottle.marks.json').replace('runs/squares', 'runs/bottle')
+    assert f'\n{words}\n' in page, 'the page of the first hour has this command'
     asked = parse(Options, label[4:])
     assert asked.recordings == (str(bag),) and asked.marks == 'my marks.json'
 

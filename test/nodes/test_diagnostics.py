@@ -142,7 +142,8 @@ def test_work_and_inputs_of_many_threads_are_counted_and_silence_is_told(client,
     newest = Newest(client, DiagnosticArray, '/diagnostics', 10)
     waiting = ['a', 'b', 'c']
     told = Diagnostics(
-        client, ['camera/image_raw'], ['/goal/image'], queue=lambda: len(waiting))
+        client, ['camera/image_raw', 'objects'], ['/goal/image', 'episode'],
+        queue=lambda: len(waiting), expected=['episode'])
 
     def work():
         for index in range(100):
@@ -159,12 +160,15 @@ def test_work_and_inputs_of_many_threads_are_counted_and_silence_is_told(client,
         10.0, lambda message: statuses(message)['test_client: service'][2]['errors'] == '1')
     found = statuses(message)
     assert set(found) == {
-        'test_client: service', 'test_client: /camera/image_raw', 'test_client: /goal/image'}
+        'test_client: service', 'test_client: /camera/image_raw', 'test_client: /objects',
+        'test_client: /goal/image', 'test_client: /episode'}
     assert {status.hardware_id for status in message.status} == {'/test_client'}
     level, word, values = found['test_client: /camera/image_raw']
     assert (level, word, values['count']) == (DiagnosticStatus.OK, 'OK', '1600')
+    for needed in ('/objects', '/episode'):
+        assert found[f'test_client: {needed}'][:2] == (DiagnosticStatus.WARN, 'NotReceived')
     level, word, values = found['test_client: /goal/image']
-    assert (level, word) == (DiagnosticStatus.WARN, 'NotReceived')
+    assert (level, word) == (DiagnosticStatus.OK, 'NotReceived'), 'it may never come'
     assert (values['count'], values['age_s']) == ('0', 'nan')
     level, text, values = found['test_client: service']
     assert (level, text) == (DiagnosticStatus.ERROR, r'bad\nname \x1b[31m')

@@ -109,6 +109,7 @@ def test_events_have_times_and_the_picture_of_soon_after_and_are_few(monkeypatch
         'count': 1, 'text': 'the goal was not moved'}
     for _ in range(1000):
         happened.add('x' * 1000)
+    happened.look()
     assert happened.count == 1003 and len(json.loads(happened.text)['events']) == events.MOST
     shown['camera'] = np.zeros((4000, 2, 3), np.uint8)
     happened.look()

@@ -231,7 +231,7 @@ def test_the_command_waits_for_the_first_picture_as_long_as_its_timeout(
              '--out', str(tmp_path / 'answer.png'), '--timeout']
     codes = []
     try:
-        assert main([*words, '0.8']) == 1
+        assert main([*words, '6']) == 1
         assert NOTHING_CAME in capsys.readouterr().err
         asking = threading.Thread(target=lambda: codes.append(main([*words, '60'])))
         asking.start()

@@ -451,4 +451,7 @@ def test_the_explorer_selects_proposes_and_moves_goals_of_objects_by_their_own_n
         told('state', lambda state: any(
             one['name'] == 'right' and abs(one['u'] - goal['u'] - 8.0) < SIZE / 64
             for one in state['goal']['objects']))
+        ask('reset', task='push2', seed=SEED + 1)
+        told('state', lambda state: state['seed'] == SEED + 1
+             and not (state['camera']['objects'] or state['goal']['objects']))
     assert explorer.end() == 0

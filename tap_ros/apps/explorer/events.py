@@ -34,7 +34,7 @@ class Events:
     The newest events; from any thread.
 
     :param picture: returns the newest picture of a kind, uint8 (H, W, 3), None without one.
-    :ivar text: them as JSON for the page.
+    :ivar text: them as JSON for the page, as of the last look.
     :ivar count: of all events; problem: the newest that is one, and how many have been.
     """
 
@@ -42,9 +42,9 @@ class Events:
         self._picture, self._lock = picture, threading.Lock()
         self._events: deque[Event] = deque(maxlen=MOST)
         self._unseen: deque[tuple[Event, str, float]] = deque(maxlen=MOST)
-        self.count = 0
+        self._changed = True
+        self.text, self.count = '', 0
         self.problem: dict[str, Any] = {'count': 0, 'text': ''}
-        self._write()
 
     def add(self, text: str, kind: str = 'camera', problem: bool = False) -> None:
         """
@@ -61,20 +61,19 @@ class Events:
                 self.problem = {'count': self.problem['count'] + 1, 'text': text}
             elif kind:
                 self._unseen.append((event, kind, time.monotonic()))
-            self._write()
+            self._changed = True
 
     def look(self) -> None:
-        """Take the pictures of events that have none yet; to be called regularly."""
+        """Take the pictures of events that have none yet, and write `text`; again and again."""
         while self._unseen and time.monotonic() - self._unseen[0][2] >= SEEN_S:
             event, kind, _ = self._unseen.popleft()
             picture = self._picture(kind)
             if picture is not None:
-                event.picture = small(picture)
-                with self._lock:
-                    self._write()
-
-    def _write(self) -> None:
-        self.text = json.dumps({'kind': 'events', 'events': list(map(asdict, self._events))})
+                event.picture, self._changed = small(picture), True
+        if self._changed:
+            with self._lock:
+                self._changed, events = False, list(map(asdict, self._events))
+            self.text = json.dumps({'kind': 'events', 'events': events})
 
 
 def small(picture: np.ndarray) -> str:

@@ -34,7 +34,8 @@ function take(message) {
   if (message.kind === 'state') {
     const before = state;
     state = message;
-    if (before && before.scene !== state.scene) {
+    if (before?.scene !== state.scene) {
+      $('seed').value = state.seed ?? 7;
       step = '';
       select(false);
     }
@@ -89,11 +90,12 @@ function progress() {
   const clicked = clicks.length ? `${clicks.length} clicked; when all are, follow` : 'waits for objects: click on them';
   const unsure = camera.objects.filter((one) => ['unsure', 'lost'].includes(one.state)).map(({name}) => name);
   return {
-    scene: [!camera_why, camera_why || (simulator ? `${state.task}${state.seed === null ? '' : `, seed ${state.seed}`}` : `${camera.width}x${camera.height} pixels`)],
+    scene: [!camera_why, camera_why || (!simulator ? `${camera.width}x${camera.height} pixels`
+      : state.seed === null ? state.task : `${state.task}, seed ${state.seed}`)],
     objects: [count > 0 && !anew, selecting() ? clicked : !count ? 'waits for objects'
       : unsure.length ? `not sure of ${unsure.join(', ')}` : tracker ? `${count} followed` : `${count} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
-      ? `waits for a goal: ${simulator ? 'start a scene' : 'photograph it'}`
+      ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
       : count && missing.length ? `drag ${missing.join(', ')} to its goal` : goal.pictured ? 'the picture is there' : 'placed by hand',
     camera_why],
     predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : predict_why || 'ready', predict_why],
@@ -102,7 +104,8 @@ function progress() {
 
 function showState() {
   const {run, goal} = state, done = progress(), on = connected();
-  if (on) showRun(run.running ? run.stage.split(', plan')[0] || 'starting' : done.scene[0] ? 'the arm stands still' : done.scene[1], run.running ? 'busy' : done.scene[0] ? 'good' : '');
+  if (on && run.running) showRun(run.stage.split(', plan')[0] || 'starting', 'busy');
+  else if (on) showRun(done.scene[0] ? 'the arm stands still' : done.scene[1], done.scene[0] ? 'good' : '');
   document.body.classList.toggle('running', on && run.running);
   lead(run.running || run.reached ? 'go' : STEPS.find((one) => !done[one][0]) ?? 'go', run.running || run.end);
   for (const one of STEPS) {
@@ -113,7 +116,8 @@ function showState() {
   // What cannot work yet cannot be pressed.
   const busy = !on ? 'there is no connection' : run.running ? 'a goal is in progress' : '';
   for (const id of ['task', 'seed', 'start', 'another']) allow(id, busy);
-  allow('propose', busy || done.objects[2] || (!goal.pictured && 'needs a goal picture'), 'what differs between the picture of now and the goal');
+  allow('propose', busy || done.objects[2] || (!goal.pictured && 'needs a goal picture'),
+    'what differs between the picture of now and the goal');
   allow('follow', busy || done.objects[2] || (!clicks.length && 'click on the objects first'));
   allow('again', busy);
   allow('photograph', busy || done.goal[2]);
@@ -135,7 +139,8 @@ function showState() {
   listObjects();
   const wrong = state.nodes.filter((one) => one.state === 'wrong').length;
   $('nodes').className = wrong ? 'wrong' : '';
-  $('nodes').querySelector('span').textContent = wrong ? `${wrong} of ${state.nodes.length} with a problem` : `all ${state.nodes.length} work`;
+  $('nodes').querySelector('span').textContent = wrong
+    ? `${wrong} of ${state.nodes.length} with a problem` : `all ${state.nodes.length} work`;
   fill($('nodes').querySelector('tbody'), state.nodes, (one) => made('tr', {className: one.state},
     made('td', {textContent: one.name}), made('td', {textContent: one.text})));
   $('large').className = view === 'camera' && selecting() ? 'click' : movable() ? 'drag' : '';
@@ -232,6 +237,6 @@ document.addEventListener('keydown', (event) => {
   }
 });
 
-fill($('log'), ['Nothing yet: each step leaves its time, its words and a picture here.'], (text) => made('li', {className: 'wide soft', textContent: text}));
+$('log').append(made('li', {className: 'wide soft'}, 'Nothing yet: each step leaves its time, its words and a picture here.'));
 for (const one of document.querySelectorAll('#side .row button')) one.disabled = true;
 connect();
