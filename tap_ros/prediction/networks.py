@@ -198,8 +198,13 @@ class SharedDecoder(nn.Module):
 
 
 def _joined(features: torch.Tensor, batch: int) -> torch.Tensor:
-    """Put the channels of the pictures of an episode in a row, in the format channels_last."""
-    return features.unflatten(0, (batch, -1)).permute(0, 3, 4, 1, 2).flatten(3).permute(0, 3, 1, 2)
+    """
+    Put the channels of the pictures of an episode in a row.
+
+    In the format channels_last, and so is the gradient: mixed formats are slow.
+    """
+    rows = features.permute(0, 2, 3, 1).unflatten(0, (batch, -1))  # B, C, h, w, channels
+    return rows.movedim(1, 3).flatten(3).contiguous().permute(0, 3, 1, 2)
 
 
 def _double(x: torch.Tensor) -> torch.Tensor:
@@ -264,8 +269,7 @@ class PredictorNetwork(nn.Module):
             x = layer(x)
             if isinstance(layer, nn.LeakyReLU):                 # a block, fine to coarse
                 levels.append(x)
-        features = levels[-1].unflatten(0, (B, C))              # B, C, 256, 4, 4
-        code = self.head(features.flatten(1, 2))                # B, 128, 1, 1
+        code = self.head(_joined(levels[-1], B))                # B, 128, 1, 1
         if self.config.latent_size:
             if z is None:
                 z = code.new_zeros(B, self.config.latent_size)
