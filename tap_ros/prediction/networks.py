@@ -193,6 +193,8 @@ class SharedDecoder(nn.Module):
             x = block(x)
         x = _double(x)
         if self.skips is not None:
+            if x.requires_grad:  # its gradient is a part of a larger one, which is slow to double
+                x.register_hook(_channels_last)
             x = torch.cat([x, _joined(pictures.flatten(0, 1), len(pictures)).to(x.dtype)], 1)
         return self.end(x).split(self.outputs, 1)
 
@@ -205,6 +207,10 @@ def _joined(features: torch.Tensor, batch: int) -> torch.Tensor:
     """
     rows = features.permute(0, 2, 3, 1).unflatten(0, (batch, -1))  # B, C, h, w, channels
     return rows.movedim(1, 3).flatten(3).contiguous().permute(0, 3, 1, 2)
+
+
+def _channels_last(x: torch.Tensor) -> torch.Tensor:
+    return x.contiguous(memory_format=torch.channels_last)
 
 
 def _double(x: torch.Tensor) -> torch.Tensor:
