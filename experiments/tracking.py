@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import json
 from pathlib import Path
 
+from experiments.clicks import score_covered, score_pale
 from experiments.pages import render, share
 from experiments.tables import find, number, RESULTS
 from experiments.tracks import draw, score_bag, score_films
@@ -31,9 +32,23 @@ OFF = 1.35  # px of 64 that a person's clicks are off
 # Look, size (0: SIZE) and clicks of a column of the page.
 COLUMNS = {'UR10e, exact': ('arm', 0, 0.0), 'UR10e, clicks off': ('arm', 0, OFF),
            'UR10e, 64 px': ('arm', SMALL, 0.0), 'hand, exact': ('hand', 0, 0.0)}
+# Task, and factors of red, green and blue from the middle on, of a column of the second table.
+HARD = {'lifted (pick_place)': ('pick_place', None), 'stacked (stack2)': ('stack2', None),
+        'light to 60%': ('push2', (0.6, 0.6, 0.6)), 'tint': ('push2', (1.1, 1.0, 0.8))}
+HARD_EPISODES = 8
+HARD_LINES = ('median_px', 'within_2px', 'wrong_sure', 'longest_wrong_sure', 'lost', 'goal_right',
+              'goal_wrong')
+COVERED_TASKS = 'push2', 'order2'
+PALE_SCENES = 30
+CLICK_LINES = {
+    'refused': 'clicks refused', 'selected_px': 'click to the middle of the object, px',
+    'selected_within_2px': 'within 2 px at once', 'later_within_2px': 'within 2 px at last',
+    'wrong_sure': 'wrong by 3 px at last, and said to be seen',
+    'confidence_at_once': 'confidence at once'}
 LINES = {
     'median_px': 'median error, px', 'within_2px': 'right: within 2 px',
-    'wrong_sure': 'wrong by 3 px and said to be seen', 'lost': 'objects lost at the end',
+    'wrong_sure': 'wrong by 3 px and said to be seen',
+    'longest_wrong_sure': 'the same, most pictures in a row', 'lost': 'objects lost at the end',
     'recovered': 'right within three pictures after an occlusion',
     'selected_px': 'click to the middle of the object, px', 'refused': 'clicks refused',
     'cpu_ms': 'CPU a picture of two objects, ms', 'goal_right': 'found in goal pictures, right',
@@ -65,20 +80,25 @@ def run(args):
     out = Path(args.out)
     file = out / 'tracking.json'
     rows = json.loads(file.read_text()) if file.exists() else []
-    for look, size, click in COLUMNS.values():
-        for task in TASKS:
-            bag = Path(args.bags, f'{task}_{look}_{SIZE}')
-            if any((row['recording'], row['size'], row['click_px']) == (bag.name, size, click)
-                   for row in rows):
-                continue
-            collect(bag, CollectConfig(
-                task=task, episodes=EPISODES[look], seed=SEED, image_size=SIZE, look=look,
-                episodes_per_file=5), Engine(workers=1))
-            found, tracks = score_bag(bag, size, click)
-            rows += found
-            write_rows(file, rows)
-            if (look, task, size, click) == ('arm', 'push3', 0, OFF):
-                write_atomically(out / 'tracking.png', png_bytes(draw(tracks[:2])))
+    wanted = [(look, task, size, click, None) for look, size, click in COLUMNS.values()
+              for task in TASKS]
+    wanted += [('arm', task, 0, OFF, light) for task, light in HARD.values()]
+    for look, task, size, click, light in wanted:
+        bag = Path(args.bags, f'{task}_{look}_{SIZE}')
+        if any((row['recording'], row['size'], row['click_px'], row.get('light', '')) == (
+                bag.name, size, click, _said(light)) for row in rows):
+            continue
+        _collect(bag, task, look)
+        found, tracks = score_bag(bag, size, click, light)
+        rows += found
+        write_rows(file, rows)
+        if (look, task, size, click, light) == ('arm', 'push3', 0, OFF, None):
+            write_atomically(out / 'tracking.png', png_bytes(draw(tracks[:2])))
+    if not any(row['recording'] == 'lightness alone' for row in rows):
+        for task in COVERED_TASKS:
+            rows += score_covered(Path(args.bags, f'{task}_arm_{SIZE}'))
+        rows += score_pale('push2', 'hand', range(SEED, SEED + PALE_SCENES))
+        write_rows(file, rows)
     if args.real:
         rows = [row for row in rows if not row['recording'].endswith('.mp4')]
         rows += score_films(RESULTS / LABELS, args.real)
@@ -86,11 +106,25 @@ def run(args):
     write_atomically(out / 'tracking.md', page(rows, loop(RESULTS / 'tracking')))
 
 
+def _collect(bag, task, look):
+    """Record the demonstrations of a bag, see TASKS and HARD, if they are not there."""
+    collect(bag, CollectConfig(
+        task=task, episodes=EPISODES[look] if task in TASKS else HARD_EPISODES, seed=SEED,
+        image_size=SIZE, look=look, episodes_per_file=5), Engine(workers=1))
+
+
+def _said(light):
+    return '' if light is None else str(list(light))
+
+
 def page(rows, pushed):
     """Return the page of these rows, and of what loop returns."""
     rows = pd.DataFrame(rows)
+    rows['light'] = rows.get('light', pd.Series(index=rows.index, dtype=object)).fillna('')
     films = rows[rows.recording.str.endswith('.mp4')]
     return render('templates/tracking.md.j2', columns=table(rows), films=film_table(films),
+                  hard=hard(rows), clicks=clicks(rows), hard_episodes=HARD_EPISODES,
+                  places=f'{int(films[films.metric == "within_2px"].n.sum()):,}',
                   confidence=confidence(rows.drop(films.index)), real=len(films) > 0,
                   loop=pushed, seed=SEED, off=OFF, episodes=EPISODES,
                   longest=round(rows[(rows.metric == 'longest_wrong_sure')
@@ -104,7 +138,9 @@ def pooled(rows, metric):
         return '-'
     value, low, high = ((rows[name] * rows.n).sum() / rows.n.sum()
                         for name in ('value', 'ci_low', 'ci_high'))
-    if metric.endswith(('_px', '_ms')) and metric != 'within_2px':
+    if metric == 'longest_wrong_sure':
+        return f'{rows.value.max():.0f}'
+    if metric in ('median_px', 'selected_px', 'cpu_ms', 'confidence_at_once'):
         return f'{value:.2f} ({low:.2f} to {high:.2f})'
     return share((value, low, high))
 
@@ -112,8 +148,8 @@ def pooled(rows, metric):
 def of(rows, column):
     """Return the rows of a column."""
     look, size, click = COLUMNS[column]
-    return rows[rows.recording.str.contains(f'_{look}_') & (rows['size'] == size)
-                & (rows.click_px == click)]
+    return rows[rows.recording.isin([f'{task}_{look}_{SIZE}' for task in TASKS])
+                & (rows['size'] == size) & (rows.click_px == click) & (rows.light == '')]
 
 
 def table(rows):
@@ -121,6 +157,24 @@ def table(rows):
     two = rows[(rows.metric != 'cpu_ms') | ~rows.recording.str.startswith('push3')]
     return pd.DataFrame([{'': line} | {name: pooled(of(two, name), metric) for name in COLUMNS}
                          for metric, line in LINES.items()])
+
+
+def hard(rows):
+    """Return a table of metrics by column of HARD."""
+    columns = {name: rows[(rows.recording == f'{task}_arm_{SIZE}') & (rows.light == _said(light))
+                          & (rows.click_px == OFF)] for name, (task, light) in HARD.items()}
+    return pd.DataFrame([{'': LINES[metric]} | {
+        name: pooled(mine, metric) for name, mine in columns.items()} for metric in HARD_LINES])
+
+
+def clicks(rows):
+    """Return a table of single clicks."""
+    names = 'half hidden', 'lightness alone'
+    lines = [{'': line} | {name: pooled(rows[rows.recording == name], metric) for name in names}
+             for metric, line in CLICK_LINES.items()]
+    count = {name: f'{rows[(rows.recording == name) & (rows.metric == "refused")].n.sum():g}'
+             for name in names}
+    return pd.DataFrame([*lines, {'': 'clicks'} | count])
 
 
 def confidence(rows):
@@ -170,7 +224,8 @@ def loop(folder):
 
 def film_table(rows):
     """Return a table of films."""
-    some = ('median_px', 'within_2px', 'wrong_sure', 'longest_wrong_sure', 'lost', 'cpu_ms')
+    some = ('median_px', 'within_2px', 'wrong_sure', 'longest_wrong_sure', 'visible_lost',
+            'cpu_ms')
     return pd.DataFrame([{'film': film} | {metric.replace('_', ' '): round(float(
         mine[mine.metric == metric].value.iloc[0]), 2) for metric in some}
         for film, mine in rows.groupby('recording')])

@@ -62,19 +62,21 @@ class Track:
     shown: list[tuple[np.ndarray, Tracked]] = field(default_factory=list, repr=False)
 
 
-def score_bag(bag, size, click):
+def score_bag(bag, size, click, light=None):
     """
     Follow the objects of a bag; the camera is fitted to their true places.
 
     :param size: px of the longer side that pictures are scaled down to; 0: as they are.
     :param click: px of SIDE that clicks are off; 0: exact, and taken as they are.
+    :param light: factors of red, green and blue from the middle of an episode on, or None.
     :return: rows of summarise, and the tracks, some with pictures.
     """
     store = open_recordings(bag)
     make = partial(RigidTracker, fit_camera(store), snap=bool(click))
-    tracks = [follow(make, scaled(episode, size), click, keep=i < STRIPS)
+    tracks = [follow(make, relit(scaled(episode, size), light), click, keep=i < STRIPS)
               for i, episode in enumerate(store)]
-    about = {'tracker': 'rigid', 'click_px': click, 'size': size}
+    about = {'tracker': 'rigid', 'click_px': click, 'size': size,
+             'light': '' if light is None else str(list(light))}
     return [row | about for row in summarise(tracks, Path(bag).name)], tracks
 
 
@@ -172,6 +174,16 @@ def scaled(episode, size):
         goal_pixels=(episode.goal_pixels + half) * share - half)
 
 
+def relit(episode, light):
+    """Return an episode in another light from its middle on, see score_bag."""
+    if light is None:
+        return episode
+    frames = np.array(episode.frames)
+    later = frames[len(frames) // 2:]
+    later[:] = (later * np.float32(light)).clip(0, 255).astype(np.uint8)
+    return replace(episode, frames=frames)
+
+
 def is_covered(pixel, mask):
     """Return whether a robot mask (H, W) covers a pixel (u, v)."""
     if mask is None or not np.isfinite(pixel).all():
@@ -227,6 +239,8 @@ def summarise(tracks, name):
              for one, (_, states), good in zip(errors, objects, known)]
     add('wrong_sure', _over_objects(np.mean, wrong), count)
     add('longest_wrong_sure', [max(map(longest, wrong))] * 3, len(objects))
+    visible = [states[good] == LOST for (_, states), good in zip(objects, known)]
+    add('visible_lost', _over_objects(np.mean, visible), count)
     add('lost', share_interval([states[-1] == LOST for _, states in objects]), len(objects))
     again = [one for track in tracks for one in recoveries(track)]
     if again:

@@ -95,7 +95,8 @@ def start(executable, parameters=None, condition=None):
         parameters=[LaunchConfiguration('params_file'), parameters],
         # The clock of this simulation is in its namespace; another one's is not.
         remappings=[('/clock', IfElseSubstitution(LaunchConfiguration('sim'), 'clock', '/clock'))],
-        condition=condition, output='screen', emulate_tty=True)
+        # A busy machine takes longer to end a node than the 5 s after which launch would kill it.
+        condition=condition, output='screen', emulate_tty=True, sigterm_timeout='20')
 
 
 def typed(argument, value_type):

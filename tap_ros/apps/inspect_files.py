@@ -76,6 +76,7 @@ def run(args: Options) -> None:
             ('length', f'{lengths.min()} to {lengths.max()} frames, median '
                        f'{np.median(lengths):g}'),
             ('objects', listing(sorted({len(e.object_names) for e in episodes}))),
+            ('commands', listing(store.commands) or 'none'),
             ('signals', listing(sorted({name for e in episodes for name in e.signal_names}))),
             ('robot masks', f'{masked} of {len(episodes)} episodes'),
             ('task', _counted(e.task for e in episodes)),

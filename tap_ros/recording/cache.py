@@ -62,6 +62,7 @@ class EpisodeStore:
     :ivar image_size: (height, width) of the frames.
     :ivar camera_size: (height, width) as they were recorded; None where that differs.
     :ivar cameras: topics of the cameras, sorted.
+    :ivar commands: units of those to the arm; older recordings have metres in a control period.
     :ivar marked: whether marks tell episodes apart, in some of the recordings at least.
     """
 
@@ -77,6 +78,8 @@ class EpisodeStore:
         sizes = {part.camera_size for part in parts if part.camera_size}
         self.camera_size = sizes.pop() if len(sizes) == 1 else None
         self.cameras = sorted({part.topics['frame'] for part in parts})
+        self.commands = sorted({'m/s' if 'period' in part.topics else 'm in a control period'
+                                for part in parts if 'twist' in part.topics})
         self.marked = any(part.marks for part in parts)
         self.data_hash = hashlib.sha256(''.join(file_hashes).encode()).hexdigest()
 

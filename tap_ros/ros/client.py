@@ -270,10 +270,13 @@ class Client:
         Have the tracker follow other objects {name: (u, v)}, clicked in the newest picture.
 
         :param stamp_ns: of the picture that was clicked: none that is older is used.
-        :raises CallError: with the reason, such as a click on the robot; then nothing changes.
+        :raises CallError: with the reason, such as a click on the robot. The objects that are not
+            refused are followed; where all are, those before.
         """
         u, v = pixels_of(list(by_name(pixels).values()), 'pixels').T.tolist()
-        self.call('select', names=list(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
+        answer = self.call('select', names=list(pixels), u=u, v=v, stamp=to_stamp(stamp_ns))
+        if len(answer.objects) < len(pixels):
+            raise CallError(answer.message)
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""

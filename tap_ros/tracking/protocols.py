@@ -41,11 +41,13 @@ class Tracker(Protocol):
     table, whose top is z = 0) or None: without calibration. Names: tap_ros.base.plugins.
     """
 
-    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray) -> Tracked:
+    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray,
+               drawn: Sequence[np.ndarray] = ()) -> Tracked:
         """
         Follow these objects from this picture on, in place of those before.
 
         :param pixels: (K, 2), a click on each object.
+        :param drawn: K outlines (N, 2), or N = 0 where the object is to be cut out; () for none.
         :return: each at the middle of its silhouette.
         :raises TrackingError: for a click outside the picture, on the robot, beyond the table,
             or on nothing that differs from it; then those before are followed on.

@@ -19,7 +19,15 @@ from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.registration import locate, mean_shift, register
-from tap_ros.tracking.silhouette import centre, clicked, OFF, RADII, silhouette, top_face
+from tap_ros.tracking.silhouette import (
+    apart,
+    centre,
+    clicked,
+    OFF,
+    RADII,
+    silhouette,
+    top_face,
+)
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
@@ -76,27 +84,33 @@ class RigidTracker:
         self._objects: list[_Object] = []
         self._gripper: np.ndarray | None = None
 
-    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray) -> Tracked:
+    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray,
+               drawn: Sequence[np.ndarray] = ()) -> Tracked:
         """
         Follow other objects, from this picture on.
 
         :param pixels: (K, 2) (u, v), a click on each object.
+        :param drawn: see Tracker.
         :raises TrackingError: for a click outside the picture, on the robot, beyond the table, or
             on nothing that differs from it; then those before are followed on.
         """
         plane = Plane(self._camera, view.image.shape[:2])
         picture = Picture(view, plane)
         clicks = plane.shrink(np.reshape(pixels, (-1, 2)))
+        names = [f'click {tuple(round(float(x), 1) for x in pixel)}'
+                 for pixel in plane.enlarge(clicks)]
+        cuts = apart([clicked(
+            picture, click, np.delete(clicks, k, 0), names[k],
+            plane.shrink(drawn[k]) if len(drawn) and len(drawn[k]) else None)
+            for k, click in enumerate(clicks)])
         objects = []
-        for k, click in enumerate(clicks):
-            name = 'click ' + str(tuple(round(float(x), 1) for x in plane.enlarge(click)))
-            cut = clicked(picture, click, np.delete(clicks, k, 0), name)
+        for click, cut, name in zip(clicks, cuts, names):
             shown, mask, face = picture.by(cut.metric), cut.mask, top_face(cut.mask, plane)
-            sure = cut.whole and not cut.touched and cut.off(click) < OFF
-            middle = plane.of_top(centre(face))
-            # Of two witnesses that contradict each other, or of half an object: in between.
-            place = plane.of_middle(click) if not self._snap else middle if sure else (
-                middle + plane.of_middle(click)) / 2
+            off = cut.off(click)
+            sure = cut.whole and not cut.touched and off < OFF
+            # Of half an object, or two witnesses that contradict each other: half way.
+            share = 0.0 if not self._snap or off > 2 * OFF else 1.0 if sure else 0.5
+            place = (1 - share) * plane.of_middle(click) + share * plane.of_top(centre(face))
             if plane.calibrated and not (np.abs(place) < EDGE).all():
                 raise TrackingError(f'{name} is on nothing within {EDGE:g} m of the middle of the '
                                     'table, along x and y; click on an object')

@@ -23,9 +23,10 @@ LEAST_AREA = 48  # px; more than CORE, which is taken for the object whatever it
 LEAST_CONTRAST = 7.0  # of the object's colours and the table's, for a click to be believed
 COLOURFUL = 12.0  # contrast of colour without which lightness tells an object, too
 SPREAD = 1.5  # by which it exceeds what colours of the ring differ from the table's, median
-OFF, NEARER, CLEARER = 13.0, 3.0, 1.5  # px from a click to the middle that is doubted, by which
+OFF, NEARER, CLEARER = 9.0, 3.0, 1.5  # px from a click to the middle that is doubted, by which
 # another cut is better, and the factor of its contrast
 TOUCHING = 0.15  # share of an outline at the robot, without which it is all of the object
+SHARED = 0.1  # share of a cut in another one
 ENDS = 0.04  # the same at the end of the search, which is to be widened
 _RINGS = (0.75, 1.3)  # of the radius, between which the table is seen
 
@@ -161,11 +162,13 @@ def shaded(colours: np.ndarray, share: float) -> np.ndarray:
     return np.asarray(cv2.LUT(lab, COLOUR.weighed))[:, 0]
 
 
-def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str) -> Cut:
+def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
+            line: np.ndarray | None = None) -> Cut:
     """
     Cut out the object under a click, see silhouette.
 
     :param name: of the click, for the message.
+    :param line: (N, 2) outline of the object, where it is known.
     :raises TrackingError: for a click outside the picture, on the robot, or on nothing.
     """
     h, w = picture.size
@@ -174,11 +177,27 @@ def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str) -> 
     if picture.hidden[round(float(at[1])), round(float(at[0]))]:
         raise TrackingError(f'{name} is on the robot or its shadow; click on an object, or move '
                             'the robot away first')
-    cut = silhouette(picture, at, others)
+    if line is not None:
+        mask = cv2.fillPoly(np.zeros(picture.size, np.uint8), [
+            np.rint(line).clip(-999, 999).astype(int)], 1) > 0
+        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, _share(mask, picture.hidden) <= TOUCHING)
+    else:
+        cut = silhouette(picture, at, others)
     if cut.mask.sum() < LEAST_AREA or cut.contrast < LEAST_CONTRAST:
         raise TrackingError(f'{name} is on nothing that differs from the table around it; click '
                             'on an object')
     return cut
+
+
+def apart(cuts: Sequence[Cut]) -> list[Cut]:
+    """Return cuts without what is in a smaller one, too: objects touch there."""
+    found = list(cuts)
+    for k, cut in enumerate(cuts):
+        smaller = [one.mask for one in cuts if one.mask.sum() < cut.mask.sum()]
+        shared = np.logical_or.reduce(smaller) & cut.mask if smaller else np.False_
+        if shared.sum() > SHARED * cut.mask.sum() and (cut.mask & ~shared).sum() > LEAST_AREA:
+            found[k] = replace(cut, mask=cut.mask & ~shared, touched=True)
+    return found
 
 
 def outline(mask: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 from driven import SEED, select
 from geometry_msgs.msg import (
+    Point32,
+    Polygon,
     PoseStamped,
     Quaternion,
     Transform,
@@ -144,6 +146,30 @@ def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(
             scene.client.call('select', **asked)
     _, names, _ = scene.at('objects', scene.move(0.0, 0.0, 0.01))
     assert set(names) == set(clicks)
+
+
+def test_one_refused_click_does_not_refuse_the_others(scene):
+    start_ns, _ = scene.reset()
+    (name, (u, v)), *_ = scene.true_clicks(start_ns).items()
+    answer = scene.client.call('select', names=[name, 'no'], u=[u, 3.0], v=[v, SIZE - 4.0])
+    assert [one.name for one in answer.objects] == [name]
+    assert f'following {name}; no: click' in answer.message
+    _, names, _ = scene.at('objects', scene.move(0.0, 0.0, 0.01))
+    assert list(names) == [name]
+    with pytest.raises(CallError, match='no: click'):
+        scene.client.select({name: (u, v), 'no': (3.0, SIZE - 4.0)})
+
+
+def test_an_object_can_be_drawn(scene):
+    start_ns, _ = scene.reset()
+    name, (u, v) = next(iter(scene.true_clicks(start_ns).items()))
+    box = Polygon(points=[Point32(x=u + x, y=v + y) for x, y in (
+        (-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0))])
+    answer = scene.client.call('select', names=[name], u=[u], v=[v], drawn=[box])
+    across = [point.x for point in answer.outlines[0].points]
+    assert max(across) - min(across) == pytest.approx(18, abs=2)
+    with pytest.raises(CallError, match='drawn: expected'):
+        scene.client.call('select', names=[name], u=[u], v=[v], drawn=[box, box])
 
 
 class Eye:

@@ -97,8 +97,10 @@ def test_nodes_run_and_answer_as_the_page_says(tmp_path, domain):
     assert list((tmp_path / 'bags' / 'mine').glob('*.mcap'))
 
 
-def test_launch_files_start_what_they_say(tmp_path, domain):
-    launch = Started('ros2 launch tap_ros nodes.launch.py', tmp_path, 'launch', domain)
+@pytest.mark.parametrize('space', ['', '/robot1'])
+def test_launch_files_start_what_they_say_in_any_namespace(space, tmp_path, domain):
+    launch = Started('ros2 launch tap_ros nodes.launch.py' + (
+        f' namespace:={space}' if space else ''), tmp_path, 'launch', domain)
     try:
         deadline, ready = time.monotonic() + 90, 0
         while ready < 3 and time.monotonic() < deadline:
@@ -107,10 +109,16 @@ def test_launch_files_start_what_they_say(tmp_path, domain):
         assert ready == 3, launch.log.read_text(errors='replace')
         for name, value in (('sim_node', False), ('predictor_node', True),
                             ('visual_mpc_node', True)):
-            said = call(f'ros2 param get /{name} use_sim_time', tmp_path, domain)
+            said = call(f'ros2 param get {space}/{name} use_sim_time', tmp_path, domain)
             assert said.strip() == f'Boolean value is: {value}'
         assert 'success=True' in call(
-            'ros2 service call /predict_subgoal tap_msgs/srv/PredictSubgoal', tmp_path, domain)
+            f'ros2 service call {space}/predict_subgoal tap_msgs/srv/PredictSubgoal', tmp_path,
+            domain)
+        others = {'/diagnostics', '/parameter_events', '/rosout'}
+        topics = set(call('ros2 topic list', tmp_path, domain).split()) - others
+        assert all(topic.startswith(f'{space}/') for topic in topics), topics
+        said = call(f'ros2 topic info {space}/clock', tmp_path, domain)
+        assert int(said.split()[-1]) >= 2, 'planner and predictor hear it'
     finally:
         said = launch.end()
     assert said.count('process has finished cleanly') == 3, said

@@ -44,6 +44,9 @@ def test_an_older_recording_written_anew_gives_the_same_actions(tmp_path):
         for episode in before:
             writer.write(episode)
     after = list(open_recordings(tmp_path / 'a.mcap', progress=False))
+    units = [open_recordings(path, progress=False).commands for path in (
+        SAMPLE, tmp_path / 'a.mcap')]
+    assert units == [['m in a control period'], ['m/s']]
     assert all(np.array_equal(one.actions, other.actions)
                for one, other in zip(before, after, strict=True))
     fastest = {}

@@ -103,6 +103,67 @@ def test_a_click_on_no_object_is_refused_and_those_before_are_followed(tracker, 
     assert found.states == (SEEN, SEEN) and np.abs(found.pixels - STARTS).max() < 1.5
 
 
+def pale(where, lighter):
+    """Return a View of a bar that is only lighter than the table, by levels of 255."""
+    picture = table()
+    (u, v), bar = where, np.s_[-8:9, -16:17]
+    window = picture[int(v) + bar[0].start:int(v) + bar[0].stop,
+                     int(u) + bar[1].start:int(u) + bar[1].stop]
+    window[:] = (np.array([150, 120, 80]) + lighter).clip(0, 255)
+    return View(picture, np.zeros((SIZE, SIZE), np.uint8))
+
+
+@pytest.mark.parametrize('lighter', [40, 60])
+def test_what_is_only_lighter_than_the_table_is_followed(lighter):
+    tracker = load_plugin('tap_ros.trackers', 'rigid')(None)
+    found = tracker.select(pale((100, 90), lighter), [(103.0, 92.0)])
+    assert np.abs(found.pixels - (100, 90)).max() < 2
+    for step in range(5):
+        found = tracker.update(pale((100 + 4 * step, 90 + 3 * step), lighter))
+    assert found.states == (SEEN,) and np.abs(found.pixels - (116, 102)).max() < 2
+
+
+def test_half_an_object_keeps_near_the_click_until_it_is_seen_whole():
+    robot, tracker = (82, 70, 130, 130), load_plugin('tap_ros.trackers', 'rigid')(None)
+    found = tracker.select(draw(STARTS, robot=robot), [(79.0, 101.0), STARTS[1]])
+    half = (66 + 82) / 2  # the middle of what is seen, px
+    assert found.pixels[0, 0] > half + 2 and found.confidence[0] < found.confidence[1]
+    found = tracker.update(draw(STARTS))
+    assert np.abs(found.pixels - STARTS).max() < 1 and found.confidence.min() > 0.9
+
+
+@pytest.mark.parametrize('light', [(0.6, 0.6, 0.6), (1.1, 1.0, 0.8)])
+def test_other_light_changes_nothing(tracker, light):
+    moved = np.array(STARTS) + 4
+    view = draw(moved)
+    other = replace(view, image=(view.image * np.float32(light)).clip(0, 255).astype(np.uint8))
+    found = tracker.update(other)
+    assert found.states == (SEEN, SEEN) and np.abs(found.pixels - moved).max() < 1.5
+
+
+def test_a_neighbour_of_other_colours_is_left_out():
+    view = draw(STARTS)
+    view.image[85:115, 94:130] = 60, 60, 160  # it touches the first one
+    found = load_plugin('tap_ros.trackers', 'rigid')(None).select(view, STARTS)
+    assert np.abs(found.pixels - STARTS).max() < 2
+
+
+def test_what_looks_otherwise_is_not_said_to_be_seen(tracker):
+    view = draw(STARTS)
+    view.image[90:110, 60:100] = 90, 160, 90  # another one lies there now
+    for _ in range(4):
+        assert tracker.update(view).states[0] != SEEN
+
+
+def test_what_is_drawn_is_taken_as_it_is():
+    box = np.array([(60, 85), (100, 85), (100, 115), (60, 115)], float)
+    tracker = load_plugin('tap_ros.trackers', 'rigid')(None)
+    found = tracker.select(draw(STARTS), STARTS, [box, np.empty((0, 2))])
+    assert np.ptp(found.outlines[0], axis=0) == pytest.approx((40, 30), abs=1)
+    assert np.abs(found.pixels - STARTS).max() < 1.5
+    assert np.ptp(found.outlines[1], axis=0)[0] < 36
+
+
 @pytest.mark.parametrize('size', [64, 480])
 def test_pictures_of_any_size_are_followed_and_left_as_they_are(size):
     tracker, scale = load_plugin('tap_ros.trackers', 'rigid')(None), size / SIZE

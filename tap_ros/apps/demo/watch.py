@@ -153,7 +153,8 @@ def click(client: Client, watch: Watch, seed: int, start: View,
     while found is None:
         try:  # right after a reset the tracker may not have heard of the scene yet
             client.select(dict(zip(names, nearest_free(places, hidden).tolist())), start.stamp_ns)
-            found = watch.at('goal/objects', goal.stamp_ns, accept=lambda one: one.objects)
+            found = watch.at('goal/objects', goal.stamp_ns, accept=lambda one: len(
+                one.objects) == len(names))
             if found is None:
                 raise TapError('goal/objects: nothing came')
         except CallError as error:

@@ -16,7 +16,7 @@ from tap_msgs.action import ReachGoal
 from tap_ros.apps.explorer.display import Display, GoalByHand, simulated
 from tap_ros.apps.explorer.words import plain
 from tap_ros.base.errors import TapError
-from tap_ros.base.text import escaped, listing
+from tap_ros.base.text import escaped
 from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
 from tap_ros.ros.calls import CallError, reason
 from tap_ros.ros.client import Client
@@ -210,7 +210,7 @@ class ExplorerCalls:
                               u=[float(one['u']) for one in objects],
                               v=[float(one['v']) for one in objects])
         self._display.select(response, followed=True)
-        self._display.events.add(f'following {listing(one.name for one in response.objects)}')
+        self._display.events.add(escaped(response.message, 1000))
 
     def _propose(self) -> None:
         response = self._call('select', propose=True)

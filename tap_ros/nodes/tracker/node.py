@@ -108,9 +108,8 @@ class TrackerNode(Node):
                 found = [f'object_{k + 1}' for k in range(len(tracked.pixels))]
                 response.message = f'{len(found)} things differ in the goal picture'
             else:
-                tracked = self._select(request, moment, view, plane, camera)
-                found = list(request.names)
-                response.message = f'following {listing(found)}'
+                found, tracked, response.message = self._select(
+                    request, moment, view, plane, camera)
             response.objects = self._encode(
                 found, tracked, plane, moment.messages['image'].header).objects
         response.outlines = [Polygon(points=[
@@ -119,16 +118,25 @@ class TrackerNode(Node):
         return response
 
     def _select(self, request: SelectObjects.Request, moment: Moment, view: View,
-                plane: Plane | None, camera: PinholeCamera | None) -> Tracked:
+                plane: Plane | None,
+                camera: PinholeCamera | None) -> tuple[tuple[str, ...], Tracked, str]:
         """
         Follow other objects from a picture on.
 
-        :raises TapError: for names or clicks that cannot be used; then nothing changes.
+        :return: names of those that are not refused, where they are, and what is to be said.
+        :raises TapError: for names or clicks that cannot be used, and where all are refused; then
+            nothing changes.
         """
         if not 1 <= len(request.names) == len(request.u) == len(request.v) <= MAX_OBJECTS:
             raise TrackingError(
                 f'names, u and v have {len(request.names)}, {len(request.u)} and '
                 f'{len(request.v)} entries; expected as many of each, 1 to {MAX_OBJECTS}')
+        drawn = [np.array([(point.x, point.y) for point in polygon.points]).reshape(-1, 2)
+                 for polygon in request.drawn]
+        if len(drawn) not in (0, len(request.names)) or not all(
+                np.isfinite(line).all() and len(line) not in (1, 2) for line in drawn):
+            raise TrackingError('drawn: expected no polygons, or one for each name, each empty or '
+                                'of three points and more, which are finite numbers')
         found, clicks = decode_objects(encode_objects(
             request.names, np.column_stack([request.u, request.v]), None, 0, '',
             ObjectStates.SOURCE_TRACKED), 'select_objects', view.image.shape[:2])
@@ -140,7 +148,11 @@ class TrackerNode(Node):
                 f'{others} other nodes publish on {self.resolve_topic_name("objects")}; end '
                 'them, or start the simulator with objects:=tracked')
         tracker: Tracker = self._make(camera)
-        tracked = tracker.select(view, clicks)
+        kept, why = _accepted(tracker, view, clicks, drawn)
+        refused = [f'{escaped(name)}: {why[k]}' for k, name in enumerate(found) if k in why]
+        found = tuple(found[k] for k in kept)
+        tracked = tracker.select(view, clicks[kept], *_picked(drawn, kept))
+        said = '; '.join([f'following {listing(found)}', *refused])
         message = self._encode(found, tracked, plane, moment.messages['image'].header)
         self._selection = Selection(
             found, tracker, plane, view.image.shape[:2], moment.stamp_ns, self._sensors.jumps,
@@ -148,8 +160,8 @@ class TrackerNode(Node):
             tracked, message)
         self._objects.publish(message)
         self._sensors.wake()  # for the goal
-        self.get_logger().info(f'following {listing(found)}')
-        return tracked
+        self.get_logger().info(said)
+        return found, tracked, said
 
     def _propose(self, view: View, camera: PinholeCamera | None) -> Tracked:
         """
@@ -313,6 +325,25 @@ class TrackerNode(Node):
             header.frame_id if plane is None else WORLD_FRAME, ObjectStates.SOURCE_TRACKED)
         message.states, message.confidence = tracked.states, list(map(float, tracked.confidence))
         return message
+
+
+def _accepted(tracker: Tracker, view: View, clicks: np.ndarray,
+              drawn: Sequence[np.ndarray]) -> tuple[list[int], dict[int, TrackingError]]:
+    """Return which clicks are on objects, and why others are refused; TrackingError for all."""
+    why: dict[int, TrackingError] = {}
+    for k in range(len(clicks)):
+        try:
+            tracker.select(view, clicks[[k]], *_picked(drawn, [k]))
+        except TrackingError as error:
+            why[k] = error
+    if len(why) == len(clicks):
+        raise next(iter(why.values()))
+    return [k for k in range(len(clicks)) if k not in why], why
+
+
+def _picked(drawn: Sequence[np.ndarray], kept: Sequence[int]) -> tuple[list[np.ndarray], ...]:
+    """Return what select is given beside clicks: some trackers know no outlines."""
+    return ([drawn[k] for k in kept],) if drawn else ()
 
 
 @dataclass(frozen=True)
