@@ -90,7 +90,7 @@ class RigidTracker:
         Follow other objects, from this picture on.
 
         :param pixels: (K, 2) (u, v), a click on each object.
-        :param drawn: see Tracker.
+        :param drawn: K outlines (N, 2), or N = 0 where the object is to be cut out; () for none.
         :raises TrackingError: for a click outside the picture, on the robot, beyond the table, or
             on nothing that differs from it; then those before are followed on.
         """
