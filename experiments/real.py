@@ -22,16 +22,23 @@ from tap_ros.prediction.nearest_keyframe import NearestKeyframe
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.protocol import Request
 from tap_ros.recording.bags import reading_like
-from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.marks import write_marks
 from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import film_of, label, SIZE
 
 WITHIN_S = 0.5, 1.0
 ROWS = 6  # demonstrations that are drawn
-WAYS: dict[str, dict[str, Any]] = {  # a name in the table: settings beside those of `foreign`
-    'two pictures, new pixels': {}, 'three pictures, copying': {
-        'keyframes': True, 'new_pixels': False}}
+COPYING: dict[str, Any] = {'keyframes': True, 'new_pixels': False}
+# A folder: the name in the table, and settings beside those of `foreign`.
+WAYS: dict[str, tuple[str, dict[str, Any]]] = {
+    'two': ('two pictures, new pixels', {}),
+    'three': ('three pictures, copying', COPYING),
+    # 2.25 times the pixels: as many steps less.
+    'three_96px': ('three pictures of 96 px, equal time', COPYING | {'size': 96, 'steps': 355})}
+DRAWN = 'two', 'three'  # of them, in pictures
+QUALITY = 65  # of these, as JPEG
+COLUMNS = 5  # pairs of an answer and the true frame, in the picture of all
 
 
 @dataclass(frozen=True)
@@ -76,9 +83,14 @@ def run(options: Options) -> None:
             write_atomically(path, json.dumps(found) + '\n')
         for way, values in json.loads(path.read_text()).items():
             rows.setdefault(way, []).append(np.array(values))
+    write_atomically(Path(options.out, f'{options.name}.json'), '{' + ',\n'.join(
+        f'"{way}": {json.dumps([part.round(5).tolist() for part in parts])}'
+        for way, parts in rows.items()) + '}\n')
     within = ' | '.join(f'within {s:g} s' for s in WITHIN_S)
-    image = sheet(options, truth)
-    cv2.imwrite(str(Path(options.out, f'{options.name}.jpg')), image[..., ::-1])
+    six, every = sheets(options, truth)
+    for name, image in ((options.name, six), (f'{options.name}_all', every)):
+        cv2.imwrite(str(Path(options.out, f'{name}.jpg')), image[..., ::-1],
+                    [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     print(f'| {options.name}, {options.marks} marks, {options.draws} draws | error at the moment '
           f'/ copying | {within} |\n|---|---|---|---|')
     for way, parts in rows.items():
@@ -89,25 +101,31 @@ def run(options: Options) -> None:
             f'{one.value:.0%} ({one.low:.0%} to {one.high:.0%})' for one in shares) + ' |')
 
 
-def sheet(options: Options, truth: dict[str, dict[str, float]]) -> np.ndarray:
+def sheets(options: Options, truth: dict[str, dict[str, float]]) -> tuple[np.ndarray, np.ndarray]:
     """
-    Draw held-out demonstrations of the first draw at the camera's resolution.
+    Draw held-out demonstrations at the camera's resolution.
 
-    Columns: start, goal, what each predictor shows, and the frame of the moment.
+    :return: of the first draw rows of start, goal, what each predictor shows, and the frame of the
+        moment; of all draws, side by side, what that of three pictures shows, and that frame.
     """
-    folder = Path(options.out, f'{options.name}_0')
-    predictors = [SubgoalPredictor(*load_network(
-        folder / way.split()[0] / 'predictor.safetensors')) for way in WAYS]
-    store = open_recordings(options.recordings, reading=replace(reading_like(
-        predictors[0].training, [options.recordings]), size=0))
-    rows = []
-    for i in sorted(order_of(len(store), options, 0)[:options.held_out])[:ROWS]:
-        frames = store.frames(i)
-        (at, _), = frames_of(store, i, np.array([truth[str(i)][f'{options.name}_s']]))
-        request = Request(frames[0], frames[-1])
-        rows.append([frames[0], frames[-1], *(
-            one.predict_together([request])[0][0].image for one in predictors), frames[at]])
-    return grid(rows)
+    first, pairs = list[list[np.ndarray]](), list[np.ndarray]()
+    for draw in range(options.draws):
+        folder = Path(options.out, f'{options.name}_{draw}')
+        predictors = [SubgoalPredictor(*load_network(folder / way / 'predictor.safetensors'))
+                      for way in DRAWN]
+        store = open_recordings(options.recordings, reading=replace(reading_like(
+            predictors[0].training, [options.recordings]), size=0))
+        for i in sorted(order_of(len(store), options, draw)[:options.held_out]):
+            frames = store.frames(i)
+            (at, _), = frames_of(store, i, np.array([truth[str(i)][f'{options.name}_s']]))
+            request = Request(frames[0], frames[-1])
+            answers = [one.predict_together([request])[0][0].image for one in predictors]
+            pairs += [answers[-1], frames[at]]
+            if len(first) < ROWS:
+                first.append([frames[0], frames[-1], *answers, frames[at]])
+    width = 2 * COLUMNS
+    pairs += [np.full_like(pairs[0], 255)] * (-len(pairs) % width)
+    return grid(first), grid([pairs[k:k + width] for k in range(0, len(pairs), width)])
 
 
 def order_of(count: int, options: Options, draw: int) -> list[int]:
@@ -136,25 +154,29 @@ def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
     file = folder / 'marks.json'
     write_marks(file, whole, [options.recordings], {
         i: frames_of(whole, i, moments[i]) for i in marked})
-    networks = {}
-    for way, settings in WAYS.items():
-        weights = train(
-            options.recordings, folder / way.split()[0], recipe='foreign', marks=str(file),
-            image_topic=tuple(filter(None, [options.image_topic])), crop='centre', size=SIZE,
-            threads=1, seed=draw, held_out=(
-                f'{options.recordings}:{",".join(map(str, left_out))}',), **settings)
-        networks[way], training = load_network(weights)
-    store = open_recordings(options.recordings, reading=reading_like(
-        training, [options.recordings]))
-    labels = label([film_of(whole, i) for i in range(len(whole))], {
-        i: moments[i] for i in marked}, [options.name]).moments
-    alike = NearestKeyframe(store, {
-        i: frames_of(store, i, labels[i]) for i in range(len(store)) if i not in left_out})
-    marks = {i: frames_of(store, i, moments[i]) for i in held_out}
+    marks = {i: frames_of(whole, i, moments[i]) for i in held_out}
     found = {}
-    for way, predictor in {**networks, 'most alike keyframes': alike}.items():
+
+    def add(name: str, predictor: Any, store: EpisodeStore) -> None:
         scores = evaluate(predictor, store, held_out, 'last', marks=marks)['prediction']
-        found[way] = [scores.at_mark.tolist(), scores.copying_at_mark.tolist(), seconds_off(
+        found[name] = [scores.at_mark.tolist(), scores.copying_at_mark.tolist(), seconds_off(
             [marks[i] for i in held_out], [store[i].stamps for i in held_out],
             scores.match_step).tolist()]
+
+    for way, (name, settings) in WAYS.items():
+        weights = train(
+            options.recordings, folder / way, **{
+                'recipe': 'foreign', 'marks': str(file), 'crop': 'centre', 'size': SIZE,
+                'image_topic': tuple(filter(None, [options.image_topic])), 'threads': 1,
+                'seed': draw, 'held_out': (
+                    f'{options.recordings}:{",".join(map(str, left_out))}',), **settings})
+        network, training = load_network(weights)
+        add(name, network, open_recordings(options.recordings, reading=reading_like(
+            training, [options.recordings])))
+    store = open_recordings(options.recordings, reading=Reading(
+        image_topic=options.image_topic, crop='centre', size=SIZE))
+    labels = label([film_of(whole, i) for i in range(len(whole))], {
+        i: moments[i] for i in marked}, [options.name]).moments
+    add('most alike keyframes', NearestKeyframe(store, {
+        i: frames_of(store, i, labels[i]) for i in range(len(store)) if i not in left_out}), store)
     return found
