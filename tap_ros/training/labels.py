@@ -34,6 +34,7 @@ REACH_S = (0.0, 0.3, 0.6)  # how far around a frame models look: of AROUND_S so 
 # are, so that one in which little happens says little.
 GREY, PLAIN_GREY = (0.0, 0.1, 0.3, 1.0), (0.3, 1.0, 2.0)
 LEAST_SHARE = 1e-3  # of a model that counts in the average
+FOLDS = 20  # of the marked demonstrations, at most, that are left out in turn; of so few each one
 RIDGE = 0.2  # price of the squared weights, in nats; features have variance 1
 SPREAD_S = 0.1  # a mark is off by so much as often as not
 TOLERANCE_S = 0.3  # within which a label is held to be right
@@ -244,7 +245,7 @@ def moments_of(one: Film, log_posterior: np.ndarray) -> tuple[np.ndarray, np.nda
 def fit(films: Sequence[Film],
         moments: Sequence[np.ndarray]) -> tuple[MomentModel | Average, list[np.ndarray]]:
     """
-    Learn models from marks, and from all marks but those of each demonstration, to weigh them.
+    Learn models from marks, and from all marks but those of each fold, to weigh them.
 
     :param films: that were marked; moments: of each (M,) s.
     :return: the average, and of each what the others make of it, see Labels.left_out.
@@ -254,18 +255,20 @@ def fit(films: Sequence[Film],
         return MomentModel(films, moments, GREY[1]), []
     kinds = list(product((*GREY, *(-one for one in PLAIN_GREY)), REACH_S))
     models = [MomentModel(films, moments, *kind) for kind in kinds]
-    worth, others = np.empty((len(models), len(films))), list[list[MomentModel]]()
+    worth, folds = np.empty((len(models), len(films))), list[list[MomentModel]]()
+    for first in range(min(FOLDS, len(films))):
+        rest = [i for i in range(len(films)) if i % FOLDS != first]
+        marked = [films[i] for i in rest], [moments[i] for i in rest]
+        folds.append([MomentModel(*marked, *kind, like) for kind, like in zip(kinds, models)])
     for i, (one, marks) in enumerate(zip(films, moments)):
-        rest = [*films[:i], *films[i + 1:]], [*moments[:i], *moments[i + 1:]]
-        others.append([MomentModel(*rest, *kind, like) for kind, like in zip(kinds, models)])
         near = np.abs(one.stamps - marks[:, None]) <= one.tolerance  # (M, T)
-        for k, model in enumerate(others[-1]):
+        for k, model in enumerate(folds[i % FOLDS]):
             right = (np.exp(model.log_posterior(one)) * near).sum(1)
             worth[k, i] = np.log(right + 1e-3).sum()
     total = worth.sum(1)
     return Average(models, total), [
-        moments_of(one, Average(those, total - worth[:, i]).log_posterior(one))[0]
-        for i, (one, those) in enumerate(zip(films, others))]
+        moments_of(one, Average(folds[i % FOLDS], total - worth[:, i]).log_posterior(one))[0]
+        for i, one in enumerate(films)]
 
 
 def label(films: Sequence[Film | None], marked: Mapping[int, np.ndarray],
