@@ -67,6 +67,11 @@ def _bench_recording():
     return Command(Options, run)
 
 
+def _bench_growth():
+    from experiments.bench.growth import Options, run
+    return Command(Options, run)
+
+
 def _bench_training():
     from experiments.bench.training import Options, run
     return Command(Options, run)
@@ -79,6 +84,11 @@ def _bench_planning():
 
 def _bench_service():
     from experiments.bench.nodes.service import Options, run
+    return Command(Options, run)
+
+
+def _bench_start():
+    from experiments.bench.nodes.start import Options, run
     return Command(Options, run)
 
 
@@ -102,9 +112,11 @@ LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weight
     'bench': ('measure speed', {
         'collect': ('speed of collecting', _bench_collect),
         'recording': ('speed of reading recordings', _bench_recording),
+        'growth': ('memory and time of large recordings', _bench_growth),
         'training': ('speed of training the predictor', _bench_training),
         'planning': ('time of a plan', _bench_planning),
         'service': ('time of an answer of the predictor node', _bench_service),
+        'start': ('time until all nodes are ready', _bench_start),
         'all': ('one after the other, into a file', _bench_all)})})
 
 if __name__ == '__main__':

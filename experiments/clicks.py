@@ -24,22 +24,23 @@ EVERY, FOLLOWED = 3, 12  # pictures from one click to the next; in which it is f
 LIFT = 30.0, 45.0  # levels of 255 that objects are lighter than the table
 
 
-def score_covered(bag):
+def score_covered(bags):
     """
-    Click on objects of a bag of SIZE px while the robot hides a part of them, and follow them.
+    Click on objects of bags of SIZE px while the robot hides a part of them, and follow them.
 
     :return: rows of _rows; 'later' is of the last picture in which an object is followed.
     """
-    store, found = open_recordings(bag), []
-    camera = fit_camera(store)
-    for episode in store:
-        rng = np.random.default_rng([episode.seed, 6])
-        for t in range(0, len(episode.frames) - FOLLOWED, EVERY):
-            for true in np.swapaxes(episode.object_pixels[t:t + FOLLOWED], 0, 1):
-                mask = episode.robot_masks[t]
-                if COVERED[0] <= _share_hidden(mask, true[0]) <= COVERED[1]:
-                    click = nearest_free((true[0] + _slip(rng))[None], mask)
-                    found.append(_follow(RigidTracker(camera), episode, t, click, true))
+    found = []
+    for store in map(open_recordings, bags):
+        camera = fit_camera(store)
+        for episode in store:
+            rng = np.random.default_rng([episode.seed, 6])
+            for t in range(0, len(episode.frames) - FOLLOWED, EVERY):
+                for true in np.swapaxes(episode.object_pixels[t:t + FOLLOWED], 0, 1):
+                    mask = episode.robot_masks[t]
+                    if COVERED[0] <= _share_hidden(mask, true[0]) <= COVERED[1]:
+                        click = nearest_free((true[0] + _slip(rng))[None], mask)
+                        found.append(_follow(RigidTracker(camera), episode, t, click, true))
     return _rows(found, 'half hidden')
 
 

@@ -21,6 +21,7 @@ from pandas import DataFrame
 from PIL import Image
 from sim_bridge.simulator import Simulator
 from tap_ros.base.contract import CAMERA_SIZE
+from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import Folder
 from tap_ros.evaluation.intervals import mean_interval
@@ -49,11 +50,16 @@ class Options:
     """
     Options of the command.
 
+    :param weights: files instead of shipped weights, such as
+        grasp=runs/grasp/predictor.safetensors; then only their rows are scored.
     :param scenes: of each row of the table.
+    :param first_scene: its seed; what is chosen by scenes is chosen by others than the table's.
     :param out: folder for fullsize.json, fullsize.jpg and fullsize.md.
     """
 
+    weights: tuple[str, ...] = ()
     scenes: int = 50
+    first_scene: int = FIRST_SCENE
     out: Folder = 'runs/results'
 
 
@@ -79,14 +85,14 @@ def run(args: Options) -> None:
     """Score, print the table, and write the results."""
     torch.set_num_threads(1)
     found, sheet = dict[str, list[dict[str, float]]](), list[list[np.ndarray]]()
-    for row in ROWS:
+    for row, weights in scored(args.weights).items():
         task, _, demonstrated = row.partition(' ')
-        network, training = load_network(task)
+        network, training = load_network(weights)
         predictor = SubgoalPredictor(network, training)
         camera = Simulator(task, image_size=CAMERA_SIZE)
         scores = found[row] = []
         try:
-            seeds = range(FIRST_SCENE, FIRST_SCENE + args.scenes)
+            seeds = range(args.first_scene, args.first_scene + args.scenes)
             for case in tqdm(cases(camera, seeds, bool(demonstrated)), row, args.scenes, delay=1):
                 score, pictures = compare(network, predictor, case)
                 scores.append(score)
@@ -97,10 +103,22 @@ def run(args: Options) -> None:
     folder = Path(args.out)
     write_atomically(folder / 'fullsize.json', '{' + ',\n'.join(
         f'"{row}": {json.dumps(scores)}' for row, scores in found.items()) + '}\n')
-    write_atomically(folder / 'fullsize.md', page(found))
+    write_atomically(folder / 'fullsize.md', page(found, args.first_scene))
     write_sheet(folder / 'fullsize.jpg', sheet)
     print(table(found))
     print(folder / 'fullsize.md')
+
+
+def scored(weights: tuple[str, ...]) -> dict[str, str]:
+    """Return the weights of each row of the table, by its name; see Options."""
+    if not weights:
+        return {row: row.partition(' ')[0] for row in ROWS}
+    given = dict(one.partition('=')[::2] for one in weights)
+    for name, file in given.items():
+        if not file or not any(row.partition(' ')[0] == name for row in ROWS):
+            raise ConfigError(f'weights: expected a row and a file, such as grasp=FILE; rows: '
+                              f'{", ".join(ROWS)}; got {name}')
+    return {row: given[name] for row in ROWS if (name := row.partition(' ')[0]) in given}
 
 
 def cases(camera: Simulator, seeds: range, demonstrated: bool) -> Iterator[Case]:
@@ -193,12 +211,13 @@ def truth_is_known(row: str) -> bool:
     return row in ('push2', 'order2')
 
 
-def page(found: dict[str, list[dict[str, float]]]) -> str:
+def page(found: dict[str, list[dict[str, float]]], first_scene: int = FIRST_SCENE) -> str:
     """Write the page of the results."""
-    small, full = (np.mean([score[name] for row, scores in found.items() if truth_is_known(row)
-                            for score in scores]) for name in ('objects_px', 'objects_full_px'))
+    known = [row for row in found if truth_is_known(row)] or found
+    small, full = (np.mean([score[name] for row in known for score in found[row]])
+                   for name in ('objects_px', 'objects_full_px'))
     return render('templates/fullsize.md.j2', table=table(found), size=CAMERA_SIZE,
-                  seed=FIRST_SCENE, small_px=f'{small:.2f}', full_px=f'{full:.2f}')
+                  seed=first_scene, small_px=f'{small:.2f}', full_px=f'{full:.2f}')
 
 
 def write_sheet(path: Path, rows: list[list[np.ndarray]]) -> None:

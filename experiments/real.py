@@ -49,6 +49,7 @@ class Options:
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param marks: demonstrations that are marked in each draw.
     :param held_out: demonstrations that are scored in each draw.
+    :param trained_on: demonstrations, the marked among them; 0: all others.
     :param draws: how many, each with others held out and marked; draw k has the seed k.
     :param out: folder of the trainings; those that are done are kept.
     """
@@ -59,6 +60,7 @@ class Options:
     image_topic: Topic = ''
     marks: int = 10
     held_out: int = 10
+    trained_on: int = 0
     draws: int = 4
     out: Folder = 'runs/real'
 
@@ -113,6 +115,10 @@ def order_of(count: int, options: Options, draw: int) -> list[int]:
     if options.draws * options.held_out > count:
         raise ConfigError(f'{options.draws} draws that hold out {options.held_out} need '
                           f'{options.draws * options.held_out} demonstrations; there are {count}')
+    most = count - options.held_out
+    if not options.marks <= (options.trained_on or most) <= most:
+        raise ConfigError(f'trained_on {options.trained_on}: expected {options.marks}, those that '
+                          f'are marked, to {most}, those that are not held out')
     return np.roll(np.random.default_rng(0).permutation(count),
                    -draw * options.held_out).tolist()
 
@@ -125,6 +131,7 @@ def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
     moments = [np.array([truth[str(i)][f'{options.name}_s']]) for i in range(len(whole))]
     order = order_of(len(whole), options, draw)
     held_out, marked = sorted(order[:options.held_out]), order[-options.marks:]
+    left_out = sorted(order[:-options.trained_on] if options.trained_on else held_out)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / 'marks.json'
     write_marks(file, whole, [options.recordings], {
@@ -135,14 +142,14 @@ def score(options: Options, truth: dict[str, dict[str, float]], draw: int,
             options.recordings, folder / way.split()[0], recipe='foreign', marks=str(file),
             image_topic=tuple(filter(None, [options.image_topic])), crop='centre', size=SIZE,
             threads=1, seed=draw, held_out=(
-                f'{options.recordings}:{",".join(map(str, held_out))}',), **settings)
+                f'{options.recordings}:{",".join(map(str, left_out))}',), **settings)
         networks[way], training = load_network(weights)
     store = open_recordings(options.recordings, reading=reading_like(
         training, [options.recordings]))
     labels = label([film_of(whole, i) for i in range(len(whole))], {
         i: moments[i] for i in marked}, [options.name]).moments
     alike = NearestKeyframe(store, {
-        i: frames_of(store, i, labels[i]) for i in range(len(store)) if i not in held_out})
+        i: frames_of(store, i, labels[i]) for i in range(len(store)) if i not in left_out})
     marks = {i: frames_of(store, i, moments[i]) for i in held_out}
     found = {}
     for way, predictor in {**networks, 'most alike keyframes': alike}.items():

@@ -95,8 +95,7 @@ def run(args):
         if (look, task, size, click, light) == ('arm', 'push3', 0, OFF, None):
             write_atomically(out / 'tracking.png', png_bytes(draw(tracks[:2])))
     if not any(row['recording'] == 'lightness alone' for row in rows):
-        for task in COVERED_TASKS:
-            rows += score_covered(Path(args.bags, f'{task}_arm_{SIZE}'))
+        rows += score_covered([Path(args.bags, f'{task}_arm_{SIZE}') for task in COVERED_TASKS])
         rows += score_pale('push2', 'hand', range(SEED, SEED + PALE_SCENES))
         write_rows(file, rows)
     if args.real:

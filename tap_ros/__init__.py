@@ -51,6 +51,7 @@ if not os.access(_home, os.W_OK):
 # nodes stay light.
 _EXPORTS = {
     'Arm': 'tap_ros.robots.arm',
+    'arm_from_urdf': 'tap_ros.robots.from_urdf',
     'Camera': 'sim_bridge.world.camera',
     'carry_out': 'sim_bridge.tasks.motions',
     'Client': 'tap_ros.ros.client',

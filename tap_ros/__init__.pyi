@@ -35,6 +35,7 @@ from tap_ros.recording.writer import EpisodeWriter as EpisodeWriter
 from tap_ros.robots.arm import Arm as Arm
 from tap_ros.robots.arm import get_arm as get_arm
 from tap_ros.robots.arm import Mount as Mount
+from tap_ros.robots.from_urdf import arm_from_urdf as arm_from_urdf
 from tap_ros.ros.client import Client as Client
 from tap_ros.tracking.protocols import Tracked as Tracked
 from tap_ros.tracking.protocols import Tracker as Tracker

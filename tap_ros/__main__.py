@@ -87,6 +87,7 @@ def _call() -> Command:
 
 
 def _demo() -> Command:
+    import_module('tap_ros.ros')  # without ROS it says so in a line
     from tap_ros.apps.demo.command import Options, run
     return Command(Options, run)
 

@@ -16,7 +16,7 @@ assert all(hasattr(tap_ros, name) for name in tap_ros.__all__)
 root_doc = 'README'
 include_patterns = ['*.md', 'CHANGELOG.rst', 'bags/README.md', 'docs/*.md', 'docs/results/*.md',
                     'docs/site/*.md', 'tap_ros/weights/*.md']
-exclude_patterns = ['.*', 'build', 'install', 'log', 'ros2', 'runs', 'test']
+exclude_patterns = ['.*', 'venv', 'build', 'install', 'log', 'ros2', 'runs', 'test']
 myst_heading_anchors = 3
 html_theme = 'furo'
 html_title = 'tap_ros'

@@ -14,7 +14,7 @@ import time
 from tap_ros.base.files import write_atomically
 import torch
 
-PARTS = ('collect', 'recording', 'training', 'planning', 'nodes.service')
+PARTS = ('collect', 'recording', 'growth', 'training', 'planning', 'nodes.service', 'nodes.start')
 
 
 @dataclass(frozen=True)

@@ -120,13 +120,13 @@ def _write(folder, compression, episodes, files):
         paths.append(folder / f'{compression}_{number}.mcap')
         with EpisodeWriter(paths[-1], compression) as writer:
             for seed in range(number, episodes, files):
-                episode = _make_episode(seed)
+                episode = make_episode(seed)
                 writer.write(episode)
                 frames += len(episode)
     return paths, frames
 
 
-def _make_episode(seed, size=64, T=41, K=2):
+def make_episode(seed, size=64, T=41, K=2):
     """Make up an episode: a lit table with a grain, and two patches that move."""
     random = np.random.default_rng(seed)
     table = np.linspace(60, 180, size)[:, None, None] + np.linspace(0, 30, size)[:, None]

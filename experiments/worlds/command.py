@@ -89,8 +89,9 @@ def run(args):
     """Collect, draw strips of the bottlenecks, score keyframes and trainings, write the page."""
     rows, strips = score_tasks(dict.fromkeys(args.tasks, args.seed), args.methods, args)
     if args.tasks == TASKS:
-        rows += score_tasks(HARD, WITH_MARKS, args, 'aside/')[0]
-        rows += score_tasks(ASIDE, WITH_MARKS, replace(args, seeds=1), 'aside/')[0]
+        for tasks, how in ((HARD, args), (ASIDE, replace(args, seeds=1))):
+            more = score_tasks(tasks, WITH_MARKS, how, 'aside/')
+            rows, strips = rows + more[0], strips + more[1]
     out = Path(args.out)
     write_rows(out / 'worlds.json', rows)
     write_atomically(out / 'worlds.md', page(rows))

@@ -34,7 +34,10 @@ WITH_WAYS = ('around', 'places')  # which something in the way makes different f
 BUDGETS = {'push-wall-v3': 55}  # commands; else contract.step_budget
 # Half of what is usual, so that a plan takes half the time.
 PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threads=1)
-REACHED = 2.0  # px, here about cm: within this, the object is where it shall be
+# px, here about cm: within this, the object is where it shall be. A hand that is pushing goes on
+# by 2 cm as it is lifted; chosen in scenes 900000 to 900003, which do not count.
+REACHED = {'push-wall-v3': 3.5}
+USUAL = 2.0  # elsewhere, chosen in scenes 1000000 to 1000005, which do
 DRAWN = 'direct', 'subgoal'
 FILM_SIZE, FRAME_MS, HOLD_MS = 256, 120, 3000  # pixels; of each picture, of the last one
 STRIPS = 6  # scenes of each task whose actions and subgoals are kept, to draw them
@@ -96,7 +99,7 @@ def run_scene(task, method, seed, weights, folder):
     """Run a method in a scene; return what came of it, None if the scene has no goal."""
     world = _world(task, IMAGE_SIZE)
     try:
-        start, shown = _act(world, method, seed, weights)
+        start, shown, switches = _act(world, method, seed, weights)
     except SceneError:
         return None
     kept = Path(folder, f'{method}_{seed}.npz')
@@ -106,7 +109,7 @@ def run_scene(task, method, seed, weights, folder):
     return {'task': task, 'method': method, 'seed': seed, 'ends': bool(world.succeeds()),
             'ever': any(world.said), 'steps': len(world.said),
             'goal_cm': _cm(np.linalg.norm(goal)), 'start_cm': _cm(start),
-            'final_cm': _cm(world.distances()[0])}
+            'final_cm': _cm(world.distances()[0]), 'switches': switches}
 
 
 def _cm(metres):
@@ -114,7 +117,7 @@ def _cm(metres):
 
 
 def _act(world, method, seed, weights):
-    """Act as long as a goal may take; return m at the start; pictures: start, subgoals, end."""
+    """Act; return m at the start, pictures of start, subgoals and end, steps that went on."""
     budget = BUDGETS.get(world.task_name, step_budget(1))
     if method in PLANNED:
         def predictor():
@@ -127,10 +130,10 @@ def _act(world, method, seed, weights):
         ran = run_episode(
             world, _planner(weights.forward, PLANNER),
             Method(method.replace(' ', '_'), recursion=max(1, len(world.ways))), budget, seed,
-            predictor(), REACHED)
+            predictor(), REACHED.get(world.task_name, USUAL))
         frames = ran.frames
         return ran.distances[0, 0], [
-            frames[0], *(subgoal.image for subgoal in ran.subgoals), frames[-1]]
+            frames[0], *(subgoal.image for subgoal in ran.subgoals), frames[-1]], ran.switches
     last = first = world.reset(seed)
     distance, rng = world.distances()[0], np.random.default_rng(seed)
     actions = (np.append(rng.uniform(-1, 1, 3) * ACTION_LIMIT, 0) for _ in range(budget))
@@ -138,7 +141,7 @@ def _act(world, method, seed, weights):
         actions = push_to_goal(world, ways=world.ways if method == 'around' else ())
     for _, action in zip(range(budget), actions):
         last = world.step(action)
-    return distance, [first.image, last.image]
+    return distance, [first.image, last.image], []
 
 
 def _kept(task, seed, folder):

@@ -52,9 +52,11 @@ AT, RESTS, JOLT = 0.06, 0.005, 0.025  # m: by the way; in a period of rest; as t
 FORWARD = {'robot_mask': 'arm', 'initial_weights': 'push', 'batch_size': 8, 'grow': 0.3,
            'learning_rate': 5e-4, 'device': 'cpu', 'threads': 1, 'save_every': 100,
            'split': 'crc32'}
-PREDICTOR = {'progress_margin': 0.0, 'start_crop': 0.0, 'initial_weights': 'push2',
-             'goal_picture': 'recorded', 'robot_mask': 'arm', 'fill_context': 1.0,
-             'batch_size': 8, 'device': 'cpu', 'threads': 1, 'save_every': 100}
+# The robot is taken out of all pictures: what is planned to are places of objects.
+PREDICTOR = {'progress_margin': 0.0, 'start_crop': 0.0, 'initial_weights': 'push2', 'margin': 1,
+             'colour': False, 'brightness': 0.0, 'goal_picture': 'recorded', 'robot_mask': 'all',
+             'fill_context': 1.0, 'batch_size': 8, 'device': 'cpu', 'threads': 1,
+             'save_every': 250}
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Options:
     tasks: tuple[str, ...] = ('push-wall-v3', 'push-v3', 'plate-slide-v3')
     episodes: int = 120
     steps: int = 1000
-    predictor_steps: int = 400
+    predictor_steps: int = 1500
     methods: tuple[str, ...] = METHODS
     seeds: int = 1
     scenes: int = 50
@@ -220,7 +222,7 @@ def write_results(runs, out, args):
         return
     write_rows(out / 'worlds_loop.json', rows)
     write_atomically(out / 'worlds_loop.md', render(
-        'worlds/templates/worlds_loop.md.j2', table=pd.DataFrame(summarise(rows)), marked=MARKED,
+        'worlds/templates/worlds_loop.md.j2', table=summarise(rows), marked=MARKED,
         episodes=args.episodes, steps=args.steps, predictor_steps=args.predictor_steps,
         budget=BUDGETS['push-wall-v3']))
 
@@ -231,13 +233,13 @@ def summarise(rows):
     for (task, method), same in pd.DataFrame(rows).groupby(['task', 'method'], sort=False):
         scenes = same.groupby('seed', sort=False)
         line = {'task': task, 'method': method, 'scenes': scenes.ngroups,
-                'trainings': same['training'].nunique() if method in LEARNED else ''}
-        for name in ('ends', 'ever'):
+                'trainings': same['training'].nunique() if method in LEARNED else None}
+        for name, head in (('ends', 'success at the end'), ('ever', 'at any step')):
             mean = scenes[name].mean()
-            line[name] = share(share_interval(mean.tolist()) if set(mean) <= {0, 1}
+            line[head] = share(share_interval(mean.tolist()) if set(mean) <= {0, 1}
                                else mean_interval(mean.tolist()))
-        for name in ('start_cm', 'final_cm'):
+        for name, head in (('start_cm', 'start, cm'), ('final_cm', 'end, cm')):
             value, low, high = mean_interval(scenes[name].mean().tolist())
-            line[name] = f'{value:.1f} ({low:.1f} to {high:.1f})'
-        found.append({**line, 'steps': f'{np.mean(same["steps"]):.0f}'})
-    return found
+            line[head] = f'{value:.1f} ({low:.1f} to {high:.1f})'
+        found.append({**line, 'commands': f'{np.mean(same["steps"]):.0f}'})
+    return pd.DataFrame(found).astype({'trainings': 'Int64'})

@@ -3,7 +3,8 @@
 """
 OGBench's scene, demonstrated by its authors' oracles: cube, drawer, window and button.
 
-It can be recorded, not planned in.
+Also one move of its cube-double and one press of its puzzle: their goals take several, and a
+bottleneck is of one. They can be recorded, not planned in.
 """
 
 from importlib import import_module
@@ -14,7 +15,8 @@ from sim_bridge.world.camera import Camera, Renderer
 from sim_bridge.world.gap import Gap
 from tap_ros.base.errors import ConfigError, SceneError
 
-TASKS = ('button', 'cube', 'drawer', 'window')
+ORACLES = {'button': 'button', 'cube': 'cube', 'drawer': 'drawer', 'window': 'window',
+           'cube-double': 'cube', 'puzzle': 'button'}  # of tasks; the last two have own scenes
 FOVY = 45.0  # degrees, of its camera in front
 DRAWS = 1000  # targets that are drawn until one is of the task
 
@@ -23,7 +25,7 @@ class OGBench:
     """
     What `collect` needs of a world: a thing on a table with a drawer, a window and two buttons.
 
-    :param task: what the oracle moves, one of TASKS.
+    :param task: what the oracle moves, one of ORACLES.
     :param image_size: width and height of the pictures in pixels.
     :raises ConfigError: if OGBench is not installed.
     :raises SceneError: for an unknown task.
@@ -32,9 +34,9 @@ class OGBench:
     steps = 2  # of demonstrations
 
     def __init__(self, task='cube', image_size=64):
-        if task not in TASKS:
-            raise SceneError(f'task {task!r} is unknown; valid: {", ".join(TASKS)}')
-        self.task_name = task
+        if task not in ORACLES:
+            raise SceneError(f'task {task!r} is unknown; valid: {", ".join(ORACLES)}')
+        self.task_name, self._kind = task, ORACLES[task]
         self.env, self.oracle = _make_env(task)
         self.step_ns = round(1e9 * self.env._control_timestep)
         self.reach, self.scale = self.env._arm_sampling_bounds, self.env.action_high[:3]
@@ -55,10 +57,11 @@ class OGBench:
         env = self.env
         env.reset(seed=seed)
         for _ in range(DRAWS):
-            env._cur_button_states[:] = 1
-            env._apply_button_states()
+            if self.task_name == self._kind:
+                env._cur_button_states[:] = 1
+                env._apply_button_states()
             seen, self._info = env.set_new_target()
-            if env._target_task == self.task_name:
+            if env._target_task == self._kind:
                 break
         self.oracle.reset(seen, self._info)
         # It draws where to go in the end from numpy's own generator.
@@ -79,16 +82,20 @@ class OGBench:
 
     def movable(self):
         """Return where that is which the oracle moves, m."""
-        kind, number = self.task_name, self.env._target_button
-        return np.array(self._info[{
-            'button': f'privileged/button_{number}_pos', 'cube': 'privileged/block_0_pos'}.get(
-                kind, f'privileged/{kind}_pos')])
+        name = {'button': f'button_{self._number}', 'cube': f'block_{self._number}'}.get(
+            self._kind, self._kind)
+        return np.array(self._info[f'privileged/{name}_pos'])
 
     def gap(self):
         """Return how far the robot is from that, m."""
         return self._gap(self.env._data, {
-            'button': f'button_{self.env._target_button}', 'cube': 'object_0',
-            'drawer': 'drawer_link', 'window': 'windowb_a'}[self.task_name])
+            'button': f'button_{self._number}', 'cube': f'object_{self._number}',
+            'drawer': 'drawer_link', 'window': 'windowb_a'}[self._kind])
+
+    @property
+    def _number(self):
+        """Which of several the oracle moves; 0 of one."""
+        return getattr(self.env, f'_target_{"button" if self._kind == "button" else "block"}', 0)
 
     def picture(self):
         """Return what a camera in front of the robot sees."""
@@ -97,9 +104,11 @@ class OGBench:
 
     def succeeds(self):
         """Return whether what the oracle moves is where it shall be."""
+        if self.task_name != self._kind:
+            return bool(self.env._compute_successes()[self._number])
         cubes, buttons, drawer, window = self.env._compute_successes()
-        return bool({'button': buttons[self.env._target_button], 'cube': cubes[0],
-                     'drawer': drawer, 'window': window}[self.task_name])
+        return bool({'button': buttons[self._number], 'cube': cubes[0],
+                     'drawer': drawer, 'window': window}[self._kind])
 
     def close(self):
         """Free the renderer and the environment."""
@@ -110,14 +119,17 @@ class OGBench:
 def _make_env(task):
     """Return the environment, and the oracle of a task."""
     try:
+        from ogbench.manipspace.envs.cube_env import CubeEnv
+        from ogbench.manipspace.envs.puzzle_env import PuzzleEnv
         from ogbench.manipspace.envs.scene_env import SceneEnv
         from ogbench.manipspace.oracles import markov
     except ModuleNotFoundError as error:
         raise ConfigError(
             'world ogbench: OGBench is not installed; type `pip install --no-deps -r '
             'requirements-worlds.txt` in the folder of tap_ros') from error
-    env = SceneEnv('scene', mode='data_collection', terminate_at_goal=False,
-                   visualize_info=False)
-    oracle = getattr(import_module(f'{markov.__name__}.{task}_markov'),
-                     f'{task.title()}MarkovOracle')
+    make, kind = {'cube-double': (CubeEnv, 'double'), 'puzzle': (PuzzleEnv, '3x3')}.get(
+        task, (SceneEnv, 'scene'))
+    env = make(kind, mode='data_collection', terminate_at_goal=False, visualize_info=False)
+    oracle = getattr(import_module(f'{markov.__name__}.{ORACLES[task]}_markov'),
+                     f'{ORACLES[task].title()}MarkovOracle')
     return env, oracle(env=env, max_step=10 ** 9)

@@ -41,6 +41,7 @@ GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
 MAX_PICTURE_BYTES = 32 * 2**20  # of one picture: rgb8 of 3840x2160 pixels has 24 MiB
 PICTURE_ENCODING = 'rgb8'  # in which pictures are sent and recorded
 MAP_ENCODING = '32FC1'  # of object maps
+MAP_ENCODINGS = (MAP_ENCODING, 'mono8', 'none')  # in which they can be asked for
 
 # Where the robot hides the scene: pictures of the same stamp and size as the camera's.
 MASK_ENCODING = 'mono8'

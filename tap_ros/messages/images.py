@@ -56,13 +56,17 @@ def decode_map(message: Any, name: str, size: Sequence[int] | None = None) -> np
     """
     Turn a message into an object map.
 
-    :param message: sensor_msgs/Image in MAP_ENCODING.
+    :param message: sensor_msgs/Image in MAP_ENCODING, or mono8.
     :param name: how an error calls it.
     :param size: the (height, width) wanted, or None for any.
-    :return: float32 (H, W).
+    :return: float32 (H, W); of mono8 it sums to 1.
     :raises ImageError: for another encoding, size, step or length, or values that are not finite.
     """
     with _named(name):
+        if message.encoding == 'mono8':
+            _check_kind(message, 'mono8', size)
+            bright = _rows(message, 1).astype(np.float32)
+            return np.asarray(bright / max(bright.sum(), 1))
         _check_kind(message, MAP_ENCODING, size)
         rows = np.ascontiguousarray(_rows(message, 4))
         values = rows.view('>f4' if message.is_bigendian else '<f4').astype(np.float32)
@@ -148,8 +152,12 @@ def jpeg_fields(image: np.ndarray, stamp: Stamp | int, frame_id: str) -> dict[st
             'data': data}
 
 
-def map_fields(values: np.ndarray, stamp: Stamp | int, frame_id: str) -> dict[str, Any]:
+def map_fields(values: np.ndarray, stamp: Stamp | int, frame_id: str,
+               encoding: str = MAP_ENCODING) -> dict[str, Any]:
     """Return the fields of a sensor_msgs/Image with an object map, (H, W); else as above."""
+    if encoding == 'mono8':
+        grey = np.rint(values * (255 / max(float(values.max()), 1e-30))).astype(np.uint8)
+        return _fields(grey, encoding, stamp, frame_id)
     return _fields(np.asarray(values, np.float32), MAP_ENCODING, stamp, frame_id)
 
 

@@ -8,6 +8,7 @@ import math
 from typing import Any
 
 import numpy as np
+from tap_ros.base.contract import MAP_ENCODING
 from tap_ros.base.errors import PlanningError
 from tap_ros.base.text import escaped
 from tap_ros.messages.images import decode_image, decode_map, image_fields, map_fields
@@ -22,7 +23,8 @@ class Subgoal:
 
     :param image: uint8 (H, W, 3).
     :param object_maps: float32 (K, h, w), each sums to 1: where each object should then be; of
-        the size that the network sees, which may be smaller than the picture.
+        the size that the network sees, which may be smaller than the picture. (0, h, w) in an
+        answer to a request without maps.
     :param expected_pixels: float32 (K, 2), the mean under each map, (u, v) in the picture.
     :param mass: float32 (K,), what each map summed to before normalising; far from 1 the map
         is doubtful (warp.WarpedMaps).
@@ -43,8 +45,8 @@ class Subgoal:
     warning: str = ''
 
 
-def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int,
-                   frame_id: str) -> dict[str, Any]:
+def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int, frame_id: str,
+                   encoding: str = MAP_ENCODING) -> dict[str, Any]:
     """
     Return the fields of a tap_msgs/Subgoal.
 
@@ -52,11 +54,13 @@ def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int,
     :param names: K strings.
     :param stamp: of the image that the prediction started from, a Stamp or ns.
     :param frame_id: frame of the camera.
+    :param encoding: of the maps, one of MAP_ENCODINGS.
     """
+    maps = () if encoding == 'none' else subgoal.object_maps
     return {
         'header': header_fields(stamp, frame_id),
         'image': image_fields(subgoal.image, stamp, frame_id), 'object_names': list(names),
-        'object_maps': [map_fields(values, stamp, frame_id) for values in subgoal.object_maps],
+        'object_maps': [map_fields(values, stamp, frame_id, encoding) for values in maps],
         'expected_pixels': [
             {'x': float(u), 'y': float(v)} for u, v in subgoal.expected_pixels]}
 
@@ -68,7 +72,8 @@ def decode_subgoals(response: Any, names: Sequence[str],
 
     :param response: of tap_msgs/PredictSubgoal, a success.
     :param names: K strings, the order wanted of the objects.
-    :param size: the (height, width) that object maps must have, or None for any that all have.
+    :param size: the (height, width) that object maps must have, or None for any that all have,
+        or no maps.
     :return: list of Subgoal, in the order of the answer; their mass and distance, which the
         messages lack, are NaN.
     :raises PlanningError: when subgoals, objects or what tells them apart are missing.
@@ -95,7 +100,8 @@ def decode_subgoal(message: Any, names: Sequence[str], size: Sequence[int] | Non
     :return: Subgoal.
     """
     found = tuple(message.object_names)
-    if not len(found) == len(message.object_maps) == len(message.expected_pixels):
+    if len(found) != len(message.expected_pixels) or len(message.object_maps) not in (
+            (len(found),) if size else (0, len(found))):
         raise PlanningError(
             f'subgoal: {len(message.object_maps)} object_maps and {len(message.expected_pixels)} '
             f'expected_pixels for {len(found)} object_names; expected one for each')
@@ -106,7 +112,7 @@ def decode_subgoal(message: Any, names: Sequence[str], size: Sequence[int] | Non
         raise PlanningError('subgoal: expected_pixels hold NaN or infinity; expected finite '
                             'numbers')
     image, maps = decode_image(message.image, 'image of the subgoal'), list[np.ndarray]()
-    for i in order:
+    for i in order if message.object_maps else ():
         maps.append(decode_map(message.object_maps[i], f'object map of {escaped(found[i])}', size))
         size = size or maps[0].shape
     size = size or image.shape[:2]

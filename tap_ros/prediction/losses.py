@@ -36,12 +36,14 @@ def changed_pixels(targets: torch.Tensor, context: torch.Tensor) -> torch.Tensor
 
 
 @torch.no_grad()
-def l1_errors(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+def l1_errors(images: torch.Tensor, targets: torch.Tensor,
+              wanted: torch.Tensor | None = None) -> torch.Tensor:
     """
     Measure the l1 error of each picture against each target frame, on [0, 1], without gradient.
 
     :param images: (B, Q, 3, H, W) in [-1, 1], for example the prediction and the context.
     :param targets: uint8 (B, T, 3, H, W).
+    :param wanted: bool (B, T); the errors against other frames are infinite. None: all are wanted.
     :return: (B, Q, T).
     """
     # Fastest on a CPU as frames stay in uint8 until they fit the cache, one episode at a time.
@@ -50,13 +52,23 @@ def l1_errors(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     if frames.is_cuda:
         distances = torch.stack(
             [(frames - images[:, q, None]).abs().mean(-1) for q in range(images.shape[1])], 1)
-        return distances / 255
-    distances = images.new_empty(*images.shape[:2], frames.shape[1])
-    for b, (episode, queries) in enumerate(zip(frames, images)):
-        episode = episode.float()
-        for q, query in enumerate(queries):
-            distances[b, q] = (episode - query).abs_().mean(1)
+    else:
+        B, T = frames.shape[:2]
+        ends = [(0, T)] * B if wanted is None else map(_ends, wanted)
+        distances = images.new_full((B, images.shape[1], T), math.inf)
+        for b, (first, last) in enumerate(ends):
+            episode = frames[b, first:last].float()
+            for q, query in enumerate(images[b]):
+                distances[b, q, first:last] = (episode - query).abs_().mean(1)
+    if wanted is not None:
+        distances.masked_fill_(~wanted[:, None], math.inf)
     return distances / 255
+
+
+def _ends(wanted: torch.Tensor) -> tuple[int, int]:
+    """Return the first one that is wanted, (T,), and the one behind the last."""
+    at = wanted.nonzero()
+    return (int(at[0]), int(at[-1]) + 1) if len(at) else (0, 0)
 
 
 def match_step(selection_error: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:

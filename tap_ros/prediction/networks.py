@@ -193,13 +193,24 @@ class SharedDecoder(nn.Module):
             x = block(x)
         x = _double(x)
         if self.skips is not None:
+            if x.requires_grad:  # its gradient is a part of a larger one, which is slow to double
+                x.register_hook(_channels_last)
             x = torch.cat([x, _joined(pictures.flatten(0, 1), len(pictures)).to(x.dtype)], 1)
         return self.end(x).split(self.outputs, 1)
 
 
 def _joined(features: torch.Tensor, batch: int) -> torch.Tensor:
-    """Put the channels of the pictures of an episode in a row, in the format channels_last."""
-    return features.unflatten(0, (batch, -1)).permute(0, 3, 4, 1, 2).flatten(3).permute(0, 3, 1, 2)
+    """
+    Put the channels of the pictures of an episode in a row.
+
+    In the format channels_last, and so is the gradient: mixed formats are slow.
+    """
+    rows = features.permute(0, 2, 3, 1).unflatten(0, (batch, -1))  # B, C, h, w, channels
+    return rows.movedim(1, 3).flatten(3).contiguous().permute(0, 3, 1, 2)
+
+
+def _channels_last(x: torch.Tensor) -> torch.Tensor:
+    return x.contiguous(memory_format=torch.channels_last)
 
 
 def _double(x: torch.Tensor) -> torch.Tensor:
@@ -264,8 +275,7 @@ class PredictorNetwork(nn.Module):
             x = layer(x)
             if isinstance(layer, nn.LeakyReLU):                 # a block, fine to coarse
                 levels.append(x)
-        features = levels[-1].unflatten(0, (B, C))              # B, C, 256, 4, 4
-        code = self.head(features.flatten(1, 2))                # B, 128, 1, 1
+        code = self.head(_joined(levels[-1], B))                # B, 128, 1, 1
         if self.config.latent_size:
             if z is None:
                 z = code.new_zeros(B, self.config.latent_size)

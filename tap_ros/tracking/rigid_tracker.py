@@ -90,7 +90,7 @@ class RigidTracker:
         Follow other objects, from this picture on.
 
         :param pixels: (K, 2) (u, v), a click on each object.
-        :param drawn: see Tracker.
+        :param drawn: K outlines (N, 2), or N = 0 where the object is to be cut out; () for none.
         :raises TrackingError: for a click outside the picture, on the robot, beyond the table, or
             on nothing that differs from it; then those before are followed on.
         """
@@ -106,10 +106,9 @@ class RigidTracker:
         objects = []
         for click, cut, name in zip(clicks, cuts, names):
             shown, mask, face = picture.by(cut.metric), cut.mask, top_face(cut.mask, plane)
-            off = cut.off(click)
-            sure = cut.whole and not cut.touched and off < OFF
+            sure = cut.whole and not cut.touched and cut.off(click) < OFF
             # Of half an object, or two witnesses that contradict each other: half way.
-            share = 0.0 if not self._snap or off > 2 * OFF else 1.0 if sure else 0.5
+            share = 0.0 if not self._snap else 1.0 if sure else 0.5
             place = (1 - share) * plane.of_middle(click) + share * plane.of_top(centre(face))
             if plane.calibrated and not (np.abs(place) < EDGE).all():
                 raise TrackingError(f'{name} is on nothing within {EDGE:g} m of the middle of the '

@@ -26,8 +26,8 @@ SPREAD = 1.5  # by which it exceeds what colours of the ring differ from the tab
 OFF, NEARER, CLEARER = 9.0, 3.0, 1.5  # px from a click to the middle that is doubted, by which
 # another cut is better, and the factor of its contrast
 TOUCHING = 0.15  # share of an outline at the robot, without which it is all of the object
-SHARED = 0.1  # share of a cut in another one
 ENDS = 0.04  # the same at the end of the search, which is to be widened
+SHARED = 0.1  # share of a cut that is in another one, too, without which they do not touch
 _RINGS = (0.75, 1.3)  # of the radius, between which the table is seen
 
 
@@ -84,11 +84,11 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     window = np.s_[y0:y1, x0:x1]
     y, x = np.ogrid[y0:y1, x0:x1]
     far = np.hypot(x - u, y - v)
-    apart = [np.hypot(x - other[0], y - other[1]) for other in others]  # from those
+    gaps = [np.hypot(x - other[0], y - other[1]) for other in others]  # from those
     hidden = picture.hidden[window]
     inner, outer = radius * _RINGS[0], radius * _RINGS[1]
     ring = (far > inner) & (far < outer)
-    for clear in (~hidden, *(gap > radius * 0.6 for gap in apart)):
+    for clear in (~hidden, *(gap > radius * 0.6 for gap in gaps)):
         if (ring & clear).sum() > 50:
             ring &= clear
     empty = np.zeros(picture.size, bool)
@@ -105,7 +105,7 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     near, core = far < radius, far < CORE
     mask[near] = cv2.GC_PR_BGD
     likely, possible = near & (unlike > LIKELY), (far < radius / 3) & (unlike > POSSIBLE)
-    sure = np.logical_and.reduce([near, unlike > SURE, *(far < gap for gap in apart)])
+    sure = np.logical_and.reduce([near, unlike > SURE, *(far < gap for gap in gaps)])
     if alone:
         shown = picture.by(LIGHT)
         own = Palette(shown.lab[window][core & ~hidden], LIGHT).distance(
@@ -117,7 +117,7 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     mask[sure & np.isin(parts, parts[core])] = cv2.GC_FGD
     mask[core] = cv2.GC_FGD
     mask[hidden] = cv2.GC_BGD
-    for other, gap in zip(others, apart):
+    for other, gap in zip(others, gaps):
         if np.hypot(other[0] - u, other[1] - v) > 2 * CORE:
             mask[gap < CORE] = cv2.GC_BGD
     if not (mask & 1).any():

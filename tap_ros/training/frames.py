@@ -5,6 +5,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+import math
 import tempfile
 from typing import TYPE_CHECKING, Union
 
@@ -71,6 +72,12 @@ class ResidentFrames:
         episodes = np.asarray(episodes)[:, None]
         index = np.where(times == GOAL, self._goal[episodes], self._first[episodes] + times)
         return self._frames[torch.from_numpy(index).to(self._frames.device, non_blocking=True)]
+
+
+def has_room(device: torch.device, *stores: 'Episodes') -> bool:
+    """Return whether the pictures of stores take no more than half of a GPU's free memory."""
+    pixels = sum((one.num_frames + len(one)) * math.prod(one.image_size) for one in stores)
+    return 3 * pixels <= torch.cuda.mem_get_info(device)[0] / 2
 
 
 class FilledStore:

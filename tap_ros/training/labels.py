@@ -37,6 +37,7 @@ LEAST_SHARE = 1e-3  # of a model that counts in the average
 RIDGE = 0.2  # price of the squared weights, in nats; features have variance 1
 SPREAD_S = 0.1  # a mark is off by so much as often as not
 TOLERANCE_S = 0.3  # within which a label is held to be right
+LOOSER = (1.0, 5 / 3, 10 / 3)  # times that, 0.3, 0.5 and 1 s: labels miss as few as can be
 LEAST_GAP_S = 0.4  # the least deviation of the time between two marks
 
 
@@ -227,15 +228,17 @@ class Average:
 
 def moments_of(one: Film, log_posterior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the moments (M,) s that are right within TOLERANCE_S most likely, and how likely.
+    Return the moments (M,) s of least loss, and how likely they are right within TOLERANCE_S.
+
+    The loss of a moment is how many of the tolerances LOOSER it is expected to miss.
 
     :param log_posterior: (M, T), as MomentModel returns it.
     """
-    near = np.abs(one.stamps[:, None] - one.stamps) <= one.tolerance
-    mass = np.exp(log_posterior) @ near
-    mass[:, [0, -1]] = 0
-    best = mass.argmax(1)
-    return one.stamps[best], mass[np.arange(len(best)), best].clip(0, 1)
+    gap = np.abs(one.stamps[:, None] - one.stamps)
+    mass = np.stack([np.exp(log_posterior) @ (gap <= one.tolerance * times) for times in LOOSER])
+    mass[..., [0, -1]] = 0
+    best = mass.sum(0).argmax(1)
+    return one.stamps[best], mass[0, np.arange(len(best)), best].clip(0, 1)
 
 
 def fit(films: Sequence[Film],

@@ -4,6 +4,7 @@
 
 import contextlib
 from dataclasses import dataclass, replace
+import math
 from typing import Self
 
 import numpy as np
@@ -278,7 +279,9 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, draws: Draws,
     divergences, errors = (torch.stack(values, 1) for values in zip(*terms))  # B, T
     whole = (kl_weight * divergences + errors).detach()
     match = match_step(selection_errors(
-        whole, lambda: targets.errors(targets.measured), batch, targets.config), batch.valid)
+        lambda wanted: whole.masked_fill(~wanted, math.inf),
+        lambda wanted: targets.errors(targets.measured, wanted), batch, targets.config),
+        batch.valid)
     nats, error = (values.gather(1, match[:, None]).mean()
                    for values in (divergences, errors))
     return Outcome(match, {'kl': kl_weight * nats, 'error': error}, nats=nats)

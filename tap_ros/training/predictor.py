@@ -18,7 +18,7 @@ from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.augmentation import Augmentation
 from tap_ros.training.batches import Batch, episode_order, make_batch, Pictures, Sampling
-from tap_ros.training.frames import FilledStore, ResidentFrames
+from tap_ros.training.frames import FilledStore, has_room, ResidentFrames
 from tap_ros.training.keyframes import Keyframes
 from tap_ros.training.marks import episode_preferences
 from tap_ros.training.objective import (
@@ -70,7 +70,9 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
                             autocast=make_autocast(state.precision, run.device))
         frames, filled = None, None if config.robot_mask == 'none' else FilledStore(
             run.store, config.robot_mask, progress)
-        if run.device.type == 'cuda':  # decoding and copying would be most of the time of a step
+        # Copying would be most of the time of a step on a GPU; what does not fit stays in files.
+        if run.device.type == 'cuda' and has_room(
+                run.device, *[run.store] * (1 if filled is None else 2)):
             frames = ResidentFrames(run.store, run.device, progress)
             if filled is not None:
                 filled.gather = ResidentFrames(filled, run.device, progress)

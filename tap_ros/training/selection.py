@@ -3,7 +3,6 @@
 """Which frame a prediction is trained towards: the selection error E' and its argmin (Eq. 5)."""
 
 from collections.abc import Callable
-import math
 
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction import losses
@@ -12,8 +11,10 @@ from tap_ros.training.batches import Batch
 from tap_ros.training.predictor_config import TrainingConfig
 import torch
 
+Errors = Callable[[torch.Tensor], torch.Tensor]  # against the frames that bool (B, T) names
 
-def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor], batch: Batch,
+
+def selection_errors(error: Errors, copy_error: Errors, batch: Batch,
                      config: TrainingConfig) -> torch.Tensor:
     """
     Compute E'_t of Eq. 5 for the configured method: E_t / w(t) in the paper (section 3.2).
@@ -22,30 +23,30 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
     minimum over time (Eq. 2). Where w(t) is the likelihood of a label it is a prior of the
     minimum, E_t - label_weight log w(t): the minimum chooses within what the label leaves open.
 
-    :param error: (B, T), of the prediction against each target.
-    :param copy_error: function without arguments that returns (B, C, T), the errors of the context
-        pictures against each target.
-    :return: (B, T).
+    :param error: function of bool (B, T), the frames that can be chosen, to (B, T), the errors of
+        the prediction against them.
+    :param copy_error: the same for the context pictures, to (B, C, T).
+    :return: (B, T); of padded frames anything.
     """
+    valid = batch.valid
     if config.loss == 'min':
-        return error
+        return error(valid)
     if config.selection in ('marks', 'still'):
         assert batch.preference is not None, 'made before the training'
         w = batch.preference[:, 0]
         if config.selection == 'marks':
-            return error - config.label_weight * w.log()
-        return losses.relative_to_copying(error, copy_error(), w)
+            return error(valid) - config.label_weight * w.log()
+        return losses.relative_to_copying(error(valid), copy_error(valid), w)
     preference = (losses.linear_preference(batch.times, batch.end, config.beta) if config.forward
                   else losses.bell_preference(batch.times, batch.first, batch.last))
     if config.selection == 'relative':
-        return losses.relative_to_copying(error, copy_error(), preference)
+        return losses.relative_to_copying(error(valid), copy_error(valid), preference)
     if config.selection == 'progress':
-        progress = losses.picture_progress(copy_error(), batch.valid)
+        progress = losses.picture_progress(copy_error(valid), valid)
         if config.progress_margin:
-            hidden = losses.beside_context(progress, config.progress_margin, batch.valid)
-            error = error.masked_fill(hidden, math.inf)
-        return error / losses.bell(progress)
-    return error / preference
+            valid = valid & ~losses.beside_context(progress, config.progress_margin, valid)
+        return error(valid) / losses.bell(progress)
+    return error(valid) / preference
 
 
 class Targets:
@@ -100,15 +101,21 @@ class Targets:
         if self.config.loss == 'fix':  # at the frame of the largest w
             assert batch.preference is not None, 'made before the training'
             return batch.preference[:, 0].masked_fill(~batch.valid, -1).argmax(1)
-        error = self.errors(image.detach()[:, None])[:, 0]
+        images = image.detach()[:, None]
         return losses.match_step(selection_errors(
-            error, lambda: self.errors(context.detach()), batch, self.config), batch.valid)
+            lambda wanted: self.errors(images, wanted)[:, 0],
+            lambda wanted: self.errors(context.detach(), wanted), batch, self.config), batch.valid)
 
-    def errors(self, images: torch.Tensor) -> torch.Tensor:
-        """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
+    def errors(self, images: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+        """
+        Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded.
+
+        :param wanted: bool (B, T), against which frames; the others are infinite.
+        """
         if self.augmentation:
             images = self.augmentation.undo(images)
-        return losses.l1_errors(self.batch.visible(images), self.batch.targets.movedim(-1, 2))
+        return losses.l1_errors(
+            self.batch.visible(images), self.batch.targets.movedim(-1, 2), wanted)
 
     def l1(self, image: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return the l1 errors (B,) of predictions (B, 3, H, W) at targets (B,) of T."""

@@ -6,6 +6,7 @@ from experiments import fullsize
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
+from tap_ros.base.errors import ConfigError
 from tap_ros.images.pixels import resize_image
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 
@@ -38,3 +39,12 @@ def test_errors_are_those_of_the_pictures_that_are_shown(camera):
     assert score['objects_px'] < 0.1 and score['objects_full_px'] < 0.1
     assert np.abs(resize_image(full, (64, 64)).astype(int) - resize_image(
         enlarged, (64, 64))).mean() < 2, 'the same picture'
+
+
+def test_weights_of_ones_own_are_scored_in_the_rows_of_their_task_alone():
+    assert list(fullsize.scored(())) == list(fullsize.ROWS)
+    assert fullsize.scored(('order2=a/b=c.safetensors',)) == {
+        'order2': 'a/b=c.safetensors', 'order2 demonstrated': 'a/b=c.safetensors'}
+    for wrong in ('grasps=x', 'grasp', 'grasp=', 'order2 demonstrated=x'):
+        with pytest.raises(ConfigError, match='grasp=FILE'):
+            fullsize.scored((wrong,))

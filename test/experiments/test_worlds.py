@@ -58,13 +58,14 @@ def test_bottlenecks_are_read_by_their_stamps(tmp_path):
     assert found.frames.shape[1:] == (64, 64, 3)
 
 
-def test_oracles_of_ogbench_demonstrate_as_unsteadily_as_people_do(tmp_path):
+@pytest.mark.parametrize('task', ['drawer', 'cube-double', 'puzzle'])
+def test_oracles_of_ogbench_demonstrate_as_unsteadily_as_people_do(task, tmp_path):
     pytest.importorskip('ogbench')
-    config = CollectConfig(world='ogbench', task='drawer', episodes=1, seed=2, image_size=32)
+    config = CollectConfig(world='ogbench', task=task, episodes=1, seed=2, image_size=32)
     collect(tmp_path, config, Engine(workers=1), progress=False, make=OGBench)
     episode, = open_recordings(tmp_path)
-    assert (episode.task, episode.outcome) == ('drawer', 'success')
-    world = OGBench('drawer', 32)
+    assert (episode.task, episode.outcome) == (task, 'success')
+    world = OGBench(task, 32)
     again = world.demonstrate(2)
     world.close()
     np.testing.assert_array_equal(episode.frames, again.episode.frames)

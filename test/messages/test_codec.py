@@ -11,10 +11,11 @@ import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.base.contract import MAP_ENCODINGS
 from tap_ros.base.errors import ImageError, PlanningError
 from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.messages import images, objects
-from tap_ros.messages.subgoals import decode_subgoals, Subgoal
+from tap_ros.messages.subgoals import decode_subgoal, decode_subgoals, Subgoal
 from tap_ros.ros import topics as ros_topics
 from tap_ros.ros.topics import to_stamp
 
@@ -178,6 +179,25 @@ def test_a_subgoal_carries_the_stamp_and_frame_of_the_picture_and_may_have_no_ob
     assert decoded.mass.shape == (1,) and np.isnan(decoded.mass).all()
     decoded, = decode_subgoals(answer([subgoal(2, 1)]), (), SIZE)
     assert decoded.object_maps.shape == (0, *SIZE) and decoded.expected_pixels.shape == (0, 2)
+
+
+def test_maps_may_be_bytes_or_left_out_unless_they_are_needed():
+    sent, names = subgoal(0, 1), (*NAMES, 'lost')
+    sent = replace(sent, object_maps=np.concatenate([sent.object_maps, np.zeros((1, *SIZE))]),
+                   expected_pixels=np.zeros((3, 2), np.float32))
+    for encoding in MAP_ENCODINGS:
+        message = ros_topics.encode_subgoal(sent, names, to_stamp(1), 'eye', encoding)
+        if encoding == 'none':
+            assert decode_subgoal(message, names).object_maps.shape == (0, *SIZE)
+            with pytest.raises(PlanningError, match='0 object_maps and 3 expected_pixels'):
+                decode_subgoal(message, names, SIZE)
+        elif encoding == 'mono8':
+            maps = sent.object_maps / np.maximum(sent.object_maps.sum((1, 2), keepdims=True), 1)
+            np.testing.assert_allclose(
+                decode_subgoal(message, names, SIZE).object_maps, maps, atol=1e-4)
+        else:
+            got = decode_subgoal(message, names, SIZE)
+            np.testing.assert_array_equal(got.object_maps, sent.object_maps)
 
 
 def test_the_picture_of_a_subgoal_may_be_larger_than_its_maps():

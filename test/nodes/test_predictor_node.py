@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.__main__ import main
-from tap_ros.messages.images import decode_image
+from tap_ros.messages.images import decode_image, decode_map
 from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.predictor import requests
 from tap_ros.nodes.predictor.node import PredictorNode
@@ -189,6 +189,25 @@ def test_answers_are_as_large_as_the_pictures_and_those_of_the_predictor_itself(
     shown['overlay'].wait(10, lambda m: m.width == m.height == 640)
     many = service.answer(num_samples=20, **large).subgoals
     assert [(one.image.width, one.image.height) for one in many] == 20 * [(32, 32)]
+
+
+def test_maps_are_answered_as_asked_for_and_drawn_once_someone_looks(services, client):
+    service = services['plain']
+    floats, = service.answer(**WITH_GOAL).subgoals
+    bytes_, = service.answer(map_encoding='mono8', **WITH_GOAL).subgoals
+    none, = service.answer(map_encoding='none', **WITH_GOAL).subgoals
+    assert [one.encoding for one in bytes_.object_maps] == 2 * ['mono8']
+    assert none.object_maps == [] and tuple(none.object_names) == NAMES
+    assert floats.expected_pixels == bytes_.expected_pixels == none.expected_pixels
+    for sent, exact in zip(bytes_.object_maps, floats.object_maps, strict=True):
+        exact = decode_map(exact, 'map')
+        np.testing.assert_allclose(decode_map(sent, 'map'), exact, atol=0.02 * exact.max())
+    message = service.refusal(map_encoding='jpeg', **WITH_GOAL)
+    assert "map_encoding 'jpeg' is unknown; valid: 32FC1, mono8, none" in message
+    # What is published for planners has its maps, whatever the last client wanted.
+    service.subgoal.wait(10, lambda m: m == floats)
+    overlay = Newest(client, Image, '/plain/subgoal/overlay', LATCHED)
+    overlay.wait(10, lambda m: m.header.stamp == STAMP)
 
 
 def enlarged_pictures(side):

@@ -53,7 +53,8 @@ def test_the_wheel_predicts_trains_and_plans_outside_of_the_checkout(tmp_path):
         f'(4,) {site}/tap_ros/__init__.py {site}/sim_bridge/__init__.py')
     assert (empty / 'runs' / 'try' / 'predictor.safetensors').exists()
 
-    for module, word in (('tap_ros', 'call'), ('tap_ros.nodes', 'predictor_node')):
+    for module, word in (('tap_ros', 'call'), ('tap_ros', 'demo'), ('tap_ros', 'explore'),
+                         ('tap_ros.nodes', 'predictor_node')):
         done = run('-m', module, *filter(None, [word]))
         assert done.returncode == 1 and done.stderr.startswith('error: ')
         assert 'checkout' in done.stderr and done.stderr.count('\n') == 1

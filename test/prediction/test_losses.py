@@ -27,7 +27,11 @@ def test_error_of_black_against_white_is_1_and_frames_may_be_bytes():
     frames = torch.randint(0, 256, (3, 5, 3, 8, 8), generator=generator, dtype=torch.uint8)
     images = torch.rand(3, 2, 3, 8, 8, generator=generator) * 2 - 1
     expected = l1_error(images[:, :, None], (frames.float() / 127.5 - 1)[:, None])
-    assert l1_errors(images, frames).allclose(expected, atol=1e-6)
+    everything = l1_errors(images, frames)
+    assert everything.allclose(expected, atol=1e-6)
+    wanted = torch.tensor([[0, 1, 0, 1, 0], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1]], dtype=torch.bool)
+    some = l1_errors(images, frames, wanted)  # bit for bit; the others cannot be the least
+    assert some.equal(everything.masked_fill(~wanted[:, None], math.inf))
 
 
 def test_bell_and_line_are_the_papers_and_fit_each_episodes_own_length():

@@ -21,6 +21,7 @@ from tap_ros.apps.cli import read
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import typestore
+from tap_ros.recording.reading import Reading
 import zstandard
 
 TOPIC = '/camera/image_raw'
@@ -184,6 +185,14 @@ def test_cameras_whose_arrays_end_alike_are_told_apart(tmp_path, capsys):
         for episode in (found := list(open_recordings(tmp_path / str(number)))):
             assert abs(episode.frames.mean() - pictures.mean()) < 5
         assert [len(episode) for episode in found] == [4, 4]
+    cameras = [word for name in names[1:] for word in ('--camera', name)]
+    assert main([*words[:3], str(tmp_path / 'two'), '--rate', '5', *cameras]) == 0
+    assert '/camera/obs_hand_rgb/image_raw: 4 pictures of obs/hand/rgb' in capsys.readouterr().out
+    first, second = (list(open_recordings(tmp_path / 'two', reading=Reading(image_topic=topic)))
+                     for topic in ('/camera/image_raw', '/camera/obs_hand_rgb/image_raw'))
+    for one, other in zip(first, second, strict=True):
+        assert len(one) == 2 and (one.frames == other.frames).all(), 'they show the same here'
+        assert (one.stamps == other.stamps).all()
 
 
 def test_arrays_of_pictures_are_imported_in_the_order_of_their_groups(

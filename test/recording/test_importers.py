@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from tap_ros.__main__ import main
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.reading import Reading
 
 
 def masked(data):
@@ -105,6 +106,15 @@ def test_a_camera_is_asked_for_only_among_those_that_show_something(tmp_path, ca
     assert run_import(capsys, 'import-tfrecord', file, '--out', tmp_path / 'b', '--camera',
                       'wrist', '--size', '8', '--crop', 'centre')[0] == 0
     assert open_recordings(tmp_path / 'b')[0].frames.shape == (6, 8, 8, 3)
+    file.write_bytes(record(depth) + record(rlds(frames)))
+    code, said = run_import(capsys, 'import-tfrecord', file, '--out', tmp_path / 'two',
+                            '--camera', 'image_0', '--camera', 'wrist')
+    assert code == 0 and '/camera/wrist/image_raw: 6 pictures of wrist' in said
+    assert 'of wrist: --camera: wrist; expected one of image_0' in said, 'the second has none'
+    seen = open_recordings(
+        tmp_path / 'two', reading=Reading(image_topic='/camera/wrist/image_raw'))
+    np.testing.assert_array_equal(seen[0].frames, wrist)
+    np.testing.assert_array_equal(open_recordings(tmp_path / 'two')[0].frames, frames)
 
 
 def test_damage_is_named_with_its_record_and_the_rest_is_read(tmp_path, capsys):

@@ -14,7 +14,7 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.recording.bags import list_topics
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats import lerobot_camera
-from tap_ros.recording.formats.lerobot_camera import view_names
+from tap_ros.recording.formats.other_cameras import view_names
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import EpisodeWriter
 

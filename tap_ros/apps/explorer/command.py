@@ -52,19 +52,24 @@ def run(args: Options) -> None:
         raise ConfigError('port: expected 0 to 65535; seed: 0 or more')
     folder = free_folder(args.logs)
     with NodeProcesses(folder) as processes:
-        # In lock-step a scene waits for those who look at it, however slow the machine is.
-        processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,
-                        look=args.look, objects=args.objects, image_size=CAMERA_SIZE)
-        if args.objects == 'tracked':
-            processes.start('tracker_node')
-        processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
-                        else DEFAULT_PREDICTOR)
-        processes.start('visual_mpc_node')
-        processes.start('explorer_node', host=args.host, port=args.port, task=args.task,
-                        token=args.token)
+        start_nodes(processes, args)
         print(f'starting nodes; their logs are in {folder}', flush=True)
         print(f'open {processes.wait_until_ready()} in a browser; Ctrl-C ends all nodes',
               flush=True)
         while True:
             time.sleep(0.2)
             processes.check()
+
+
+def start_nodes(processes: NodeProcesses, args: Options) -> None:
+    """Start the simulator, what sees, predicts and plans, and the page."""
+    # In lock-step a scene waits for those who look at it, however slow the machine is.
+    processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,
+                    look=args.look, objects=args.objects, image_size=CAMERA_SIZE)
+    if args.objects == 'tracked':
+        processes.start('tracker_node')
+    processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
+                    else DEFAULT_PREDICTOR)
+    processes.start('visual_mpc_node')
+    processes.start('explorer_node', host=args.host, port=args.port, task=args.task,
+                    token=args.token)

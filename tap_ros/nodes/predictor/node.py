@@ -30,7 +30,13 @@ from tap_ros.ros.parameters import check_device, Parameters
 from tap_ros.ros.polling import DeferredService
 from tap_ros.ros.robot_view import warn_if_unlike
 from tap_ros.ros.subscriptions import steady_timer
-from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, LATCHED
+from tap_ros.ros.topics import (
+    camera_topics,
+    encode_image,
+    encode_subgoal,
+    goal_topics,
+    LATCHED,
+)
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 Send = Callable[[PredictSubgoal.Response], object]
@@ -66,8 +72,8 @@ class PredictorNode(LifecycleBase):
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
         # The newest subgoal until it is published, by a timer: the answer does not wait for it.
-        self._unshown: deque[
-            tuple[requests.PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
+        self._unshown: deque[tuple[requests.PendingRequest, PredictedSubgoal]] = deque(maxlen=1)
+        self._undrawn: tuple[requests.PendingRequest, PredictedSubgoal] | None = None
         steady_timer(self, SHOW_PERIOD, self._on_timer)
         self._service = DeferredService(self, PredictSubgoal, 'predict_subgoal', self._on_request)
         self.autostart('activate')
@@ -118,15 +124,17 @@ class PredictorNode(LifecycleBase):
         self._reader.poll()
 
     def _show(self) -> None:
-        """Publish the newest subgoal, for planners and people, if it is not published yet."""
-        if not self._unshown:
-            return
-        task, subgoal, message = self._unshown.pop()
+        """Publish the newest subgoal if it is not published yet; drawn once someone looks."""
         try:
-            self._subgoal.publish(message)
-            self._picture.publish(message.image)
-            self._overlay.publish(encode_image(
-                draw(task.request, subgoal.object_maps), task.stamp, task.frame_id))
+            if self._unshown:
+                task, subgoal = self._undrawn = self._unshown.pop()
+                message = encode_subgoal(subgoal, task.names, task.stamp, task.frame_id)
+                self._subgoal.publish(message)
+                self._picture.publish(message.image)
+            if self._undrawn is not None and self._overlay.get_subscription_count():
+                (task, subgoal), self._undrawn = self._undrawn, None
+                self._overlay.publish(encode_image(
+                    draw(task.request, subgoal.object_maps), task.stamp, task.frame_id))
         except Exception as error:
             self._diagnostics.error(error)
             log_error(self, 'subgoal', error)
@@ -154,7 +162,7 @@ class PredictorNode(LifecycleBase):
                 raise found
             response = requests.encode_answer(task, *found)
             # Where to go first: the earliest subgoal of the first sample.
-            shown = task, found[0][0], response.subgoals[0]
+            shown = task, found[0][0]
         except Exception as error:
             self._refuse(send, error)
             return

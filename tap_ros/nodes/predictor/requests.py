@@ -16,7 +16,13 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.base.contract import CAMERA_FRAME, MAX_PICTURE_BYTES, MODES
+from tap_ros.base.contract import (
+    CAMERA_FRAME,
+    MAP_ENCODING,
+    MAP_ENCODINGS,
+    MAX_PICTURE_BYTES,
+    MODES,
+)
 from tap_ros.base.errors import ConfigError, ImageError, TapError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.pixels import check_image
@@ -66,6 +72,7 @@ class PendingRequest:
     no_maps: str  # why there are none; empty if there are
     stamp: Time  # of the start picture
     frame_id: str
+    map_encoding: str
 
     @property
     def rows(self) -> int:
@@ -112,6 +119,9 @@ class RequestReader:
         num_samples, depth = request.num_samples or 1, request.recursion_depth or 1
         check_work(num_samples, depth, 0)
         check_mode(request, predictor.mode)
+        if request.map_encoding not in ('', *MAP_ENCODINGS):
+            raise ConfigError(f"map_encoding '{escaped(request.map_encoding, 40)}' is unknown; "
+                              f"valid: {', '.join(MAP_ENCODINGS)}, or empty for the first")
         pixels = MAX_PICTURE_BYTES // (3 * num_samples * depth)
         start = self._view('start', request.start, request.start_objects, predictor, pixels)
         goal = (self._view('goal', request.goal, request.goal_objects, predictor, pixels)
@@ -126,7 +136,8 @@ class RequestReader:
             predictor.mode, Request(
                 start.image, goal.image if goal else None, start.pixels if names else None,
                 goal_pixels, num_samples, depth, request.seed),
-            names, no_maps, start.header.stamp, start.header.frame_id or CAMERA_FRAME)
+            names, no_maps, start.header.stamp, start.header.frame_id or CAMERA_FRAME,
+            request.map_encoding or MAP_ENCODING)
 
     def _view(self, name: str, image: Image, objects: ObjectStates, predictor: Predictor,
               most_pixels: int) -> RequestedView:
@@ -217,7 +228,8 @@ def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],
         subgoal.warning: None for subgoal in subgoals if subgoal.warning})
     return PredictSubgoal.Response(
         success=True, message=message, model_time_ms=elapsed_ms,
-        subgoals=[encode_subgoal(subgoal, task.names, task.stamp, task.frame_id)
+        subgoals=[encode_subgoal(
+            subgoal, task.names, task.stamp, task.frame_id, task.map_encoding)
                   for subgoal in subgoals],
         sample=[subgoal.sample for subgoal in subgoals],
         level=[subgoal.level for subgoal in subgoals])

@@ -29,6 +29,7 @@ from tap_ros.base.text import escaped, listing
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.bags import what_else, what_is
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.formats.other_cameras import other_cameras, print_views
 from tap_ros.recording.formats.pictures import (
     decoded,
     FILES,
@@ -42,6 +43,7 @@ from tap_ros.recording.formats.pictures import (
 from tap_ros.recording.formats.videos import at_rate
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.trust import Budget, MOST_BYTES, MOST_FRAMES
+from tap_ros.recording.writer import Views
 
 FPS = 10.0  # where nobody says another
 _KEPT = 2**20  # bytes of chunks that HDF5 keeps unpacked
@@ -57,10 +59,13 @@ def run(args: Options) -> None:
     import h5py
     while h5py.h5pl.size():  # a plug-in for an array is code
         h5py.h5pl.remove(0)
-    skipped = Skipped()
+    skipped, others = Skipped(), other_cameras(args.camera)
     files = find_files(args.paths, ('*.hdf5', '*.h5'), skipped)
 
-    def episodes() -> Iterator[Episode]:
+    def show(each: Any) -> np.ndarray:
+        return args.cut.image(_picture(each))
+
+    def episodes() -> Iterator[tuple[Episode, Views]]:
         numbers = count()
         for file in files:
             with skipped.errors_of('file', place := escaped(file.name)):
@@ -70,24 +75,28 @@ def run(args: Options) -> None:
                     budget, beside = Budget(
                         file.stat().st_size), dict[str, dict[str, Any]]()
                     arrays = dict(_arrays(root, skipped, budget, beside))
-                    for name, number in zip(_chosen(arrays, args.camera), numbers):
+                    beside_it = {topic: {_demonstration(name): arrays[name] for name in _chosen(
+                        arrays, one.key)} for topic, one in others.items()}
+                    for name, number in zip(_chosen(arrays, *args.camera[:1]), numbers):
                         with skipped.errors_of('array', f'{escaped(name)} of {place}'):
                             found = ((row / (args.fps or FPS), each)
                                      for row, each in enumerate(arrays[name]()))
-                            frames, times = decoded(
-                                at_rate(found, args.rate),
-                                lambda each: args.cut.image(_picture(each)), skipped,
-                                f'episode {number}')
-                            signals = _signals(
-                                beside.get(_demonstration(name), {}),
-                                np.rint(times * (args.fps or FPS)).astype(int), budget, skipped)
-                            yield make_episode(frames, times, task=args.task, seed=number,
-                                               **signals)
+                            frames, times = decoded(at_rate(found, args.rate), show, skipped,
+                                                    f'episode {number}')
+                            rows = np.rint(times * (args.fps or FPS)).astype(int)
+                            own = _demonstration(name)
+                            yield make_episode(
+                                frames, times, task=args.task, seed=number,
+                                **_signals(beside.get(own, {}), rows, budget, skipped)), {
+                                topic: others[topic].view(
+                                    those[own], rows, show, skipped, f'episode {number}')
+                                for topic, those in beside_it.items() if own in those}
 
     print(write_bag(args, episodes(), skipped))
+    print_views(others)
 
 
-def _chosen(arrays: Collection[str], camera: str) -> list[str]:
+def _chosen(arrays: Collection[str], camera: str = '') -> list[str]:
     """Return the names of the arrays of a camera, each an episode."""
     keys = {name: _camera(name) for name in arrays}
     short = Counter(key.rpartition('/')[2] for key in set(keys.values()))

@@ -24,10 +24,9 @@ import numpy as np
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
-from tap_ros.messages.topics import camera_view
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode, OUTCOMES
-from tap_ros.recording.formats.lerobot_camera import Camera, path_in, picture_file, view_names
+from tap_ros.recording.formats.lerobot_camera import Camera, path_in, picture_file
 from tap_ros.recording.formats.lerobot_format import (
     ACTION,
     cut_short,
@@ -47,6 +46,7 @@ from tap_ros.recording.formats.lerobot_format import (
     STATE,
     SUBTASK,
 )
+from tap_ros.recording.formats.other_cameras import print_views, view_names
 from tap_ros.recording.formats.pictures import (
     DAMAGE,
     decoded,
@@ -93,8 +93,7 @@ def run(args: Options) -> None:
     said = write_bag(args, data.episodes(args.cut, args.rate), data.skipped, len(data.rows),
                      jpeg=data.is_video(data.camera) and not args.size)
     print(f'{said} of {escaped(data.camera)}')
-    for name, one in data.others.items():
-        print(f'{camera_view(name).recorded}: {one.count} pictures of {escaped(one.key)}')
+    print_views(data.others)
     if any(data.marks):
         path = beside(args.out)
         write_marks(path, open_recordings([args.out]), [args.out], {

@@ -3,7 +3,6 @@
 """The pictures of one camera of a LeRobotDataset: files in its rows, or videos of its episodes."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import chain, count
 from pathlib import Path
 import re
 from typing import Any
@@ -146,14 +145,3 @@ def path_in(pattern: object, row: Row, part: str, chunk: int) -> Path:
     return Path(re.sub(  # not str.format, which a pattern can make do much else
         r'[{](\w+)(?::0(\d)d)?[}]',
         lambda match: str(values[match[1]]).zfill(int(match[2] or 0)), str(pattern)))
-
-
-def view_names(keys: Iterable[str]) -> list[str]:
-    """Return a name that a topic can have for each camera, by the last part of its feature."""
-    names = ['camera']  # the first one's own
-    for key in keys:
-        name = re.sub('[^A-Za-z0-9]+', '_', key.rpartition('.')[2])[:40].strip('_')
-        name = name if name[:1].isalpha() else f'view_{name}'.rstrip('_')
-        tries = chain([name], (f'{name}_{number}' for number in count(2)))
-        names.append(next(one for one in tries if one not in names))
-    return names[1:]

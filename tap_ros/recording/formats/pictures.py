@@ -82,13 +82,16 @@ class Options(Target):
     :param paths: files, or folders that hold some at any depth; they are taken in the order of
         the numbers in their names.
     :param camera: NAME of the pictures, of videos that of the files without ending; needed where
-        there are several cameras.
+        there are several cameras. Given several times, not of videos, the first is the
+        predictor's, on /camera/image_raw; each other one is kept for label, on a topic such as
+        /camera/wrist/image_raw.
     :param fps: frames a second; 0: as videos say, 10 of arrays and 5 of TFRecord files.
     :param task: what is done in them, as text; TFRecord files tell it themselves.
     """
 
     paths: Paths
-    camera: Annotated[str, conf.arg(metavar='NAME', help_behavior_hint=default_text)] = ''
+    camera: conf.UseAppendAction[Annotated[tuple[str, ...], conf.arg(
+        metavar='NAME', help_behavior_hint='(default: the only one)')]] = ()
     fps: float = 0.0
     task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
 
@@ -105,10 +108,12 @@ def run(args: Options) -> None:
 
     :raises TapError: for what cannot be read, and a folder that holds something.
     """
+    if len(args.camera) > 1:
+        raise ConfigError('--camera: videos are imported of one camera')
     skipped = Skipped()
     files = [file for path in args.paths for file in _of_camera(
         Path(path), find_files(
-            [path], [f'*{end}' for end in VIDEOS], skipped), args.camera)]
+            [path], [f'*{end}' for end in VIDEOS], skipped), *args.camera)]
 
     def episodes() -> Iterator[Episode]:
         for number, path in enumerate(sorted(files, key=natural)):
@@ -150,7 +155,7 @@ def find_files(paths: Iterable[str | Path], patterns: Iterable[str],
     return sorted(found, key=natural)
 
 
-def _of_camera(path: Path, found: list[Path], camera: str) -> list[Path]:
+def _of_camera(path: Path, found: list[Path], camera: str = '') -> list[Path]:
     """Return the videos of a camera; a file alone as it is."""
     if not path.is_dir():
         return found
@@ -216,6 +221,7 @@ def decoded(pictures: Iterable[tuple[float, Any]], decode: Callable[[Any], np.nd
     if not frames:
         raise ValueError('none of its pictures can be used')
     return frames, np.array(numbers)
+
 
 
 def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.ndarray,

@@ -11,6 +11,7 @@ the instruction and, as signals, floats are taken; times are nominal, as records
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from functools import partial
 from itertools import count, islice
 import math
 import os
@@ -29,6 +30,7 @@ from tap_ros.base.errors import ConfigError, ImageError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.formats.other_cameras import other_cameras, print_views
 from tap_ros.recording.formats.pictures import (
     decoded,
     FILES,
@@ -41,6 +43,7 @@ from tap_ros.recording.formats.pictures import (
 )
 from tap_ros.recording.formats.videos import at_rate
 from tap_ros.recording.metadata import natural
+from tap_ros.recording.writer import Views
 
 FPS = 5.0  # where nobody says another
 _MOST_RECORD = 2**31  # bytes; those of protobuf have fewer
@@ -52,12 +55,16 @@ def run(args: Options) -> None:
 
     :raises TapError: for records that cannot be read, and a folder that holds something.
     """
-    camera, blank, skipped = args.camera, Counter[bool](), Skipped()
+    camera, others = next(iter(args.camera), ''), other_cameras(args.camera)
+    blank, skipped = Counter[bool](), Skipped()
     files = find_files(args.paths, ('*.tfrecord*',), skipped)
     for name in _missing(file for file in files if file not in set(map(Path, args.paths))):
         skipped.note('it is not there; fetch it, then import again', 'file', name)
 
-    def episodes() -> Iterator[Episode]:
+    def show(each: bytes) -> np.ndarray:
+        return args.cut.image(_picture(each))
+
+    def episodes() -> Iterator[tuple[Episode, Views]]:
         nonlocal camera
         numbers = count()
         for file in files:
@@ -79,9 +86,12 @@ def run(args: Options) -> None:
                         yield make_episode(
                             list(map(args.cut.image, frames)), times,
                             **_signals(floats, len(pictures), rows),
-                            task=said[0].decode(errors='replace'), seed=number)
+                            task=said[0].decode(errors='replace'), seed=number), {
+                            topic: one.view(partial(_of, features, one.key), rows, show, skipped,
+                                            f'record {place}') for topic, one in others.items()}
 
     print(f'{write_bag(args, episodes(), skipped)} of {escaped(camera)}')
+    print_views(others)
     if blank[True]:
         print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
 
@@ -117,6 +127,11 @@ def _choose(features: dict[str, list[bytes]], camera: str) -> str:
         raise kind(f'--camera: {escaped(camera)}; expected one of '
                    f'{listing(seen or first) or "those with pictures, but there are none"}')
     return (seen or list(first))[0]
+
+
+def _of(features: dict[str, list[bytes]], camera: str) -> list[bytes]:
+    """Return the encoded pictures of a camera that was named; RecordingError if there are none."""
+    return _pictures(features, _choose(features, camera))
 
 
 def _pictures(features: dict[str, list[bytes]], camera: str) -> list[bytes]:
