@@ -212,8 +212,13 @@ class Tables:
 
     def speed(self):
         """List what `make bench` measured."""
-        for row in json.loads((RESULTS / 'speed.json').read_text())['rows']:
+        for row in measured_speed()['rows']:
             yield Row(**row).cells
+
+
+def measured_speed():
+    """Return what `make bench` wrote: rows, and the machine they are of."""
+    return json.loads((RESULTS / 'speed.json').read_text())
 
 
 def markdown(lines, head=('claim', 'paper', 'here', 'aim')):
@@ -230,7 +235,8 @@ def page_path(name):
 def filled(name):
     """Return a page, 'prediction', 'planning', 'stacking' or 'speed', with its table anew."""
     text = page_path(name).read_text()
-    head = {'head': ('what', 'here', 'ratio', 'aim', 'what limits it')} if name == 'speed' else {}
+    head = {'head': ('what', measured_speed()['machine'], 'ratio', 'aim', 'what limits it')
+            } if name == 'speed' else {}
     table = markdown(getattr(Tables(), name)(), **head)
     if not MARKS.search(text):
         raise ConfigError(f'{name}.md: expected <!-- table --> and <!-- end -->')

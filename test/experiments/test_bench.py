@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benchmarks measure what they say."""
 
-from experiments.bench import recording
+import os
+
+from experiments.bench import growth, recording
 from experiments.bench.mppi import mppi
 from experiments.bench.rows import Row, show
 import numpy as np
@@ -19,6 +21,16 @@ def test_all_frames_are_opened_beside_another_job(monkeypatch):
     monkeypatch.setattr(recording, '_build_cache', lambda paths, scratch: 1)
     with pytest.raises(RuntimeError, match='saw 1 of'):
         recording.run(args)
+
+
+def test_memory_is_what_is_held_beside_mapped_files(tmp_path):
+    size, file = 50 * 10**6, tmp_path / 'file'
+    file.write_bytes(bytes(size))
+    before = growth.held(os.getpid())
+    mapped = np.memmap(file, np.uint8, 'r')
+    assert mapped.sum() == 0 and growth.held(os.getpid()) - before < size / 2
+    ours = np.ones(size, np.uint8)
+    assert growth.held(os.getpid()) - before > 0.9 * len(ours)
 
 
 def test_a_row_that_misses_its_aim_says_why():
