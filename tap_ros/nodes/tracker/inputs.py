@@ -1,8 +1,8 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What tracker_node sees: pictures of the camera and of the goal, their calibration, scenes."""
+"""What tracker_node sees: pictures of camera and goal, their calibration, scenes, clicks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 import math
 import time
@@ -13,6 +13,7 @@ import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import Episode
+from tap_msgs.srv import SelectObjects
 from tap_ros.base.contract import WORLD_FRAME
 from tap_ros.base.errors import ImageError, KinematicsError, TapError, TrackingError
 from tap_ros.images.robot_mask import hidden_pixels
@@ -28,7 +29,7 @@ from tap_ros.ros.parameters import declared_arm, Parameters, pose_matrix
 from tap_ros.ros.subscriptions import adapt_regularly, AdaptiveSubscription, publishers_of
 from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, STREAM
 from tap_ros.tracking.plane import check_pose, Plane
-from tap_ros.tracking.protocols import View
+from tap_ros.tracking.protocols import Tracker, View
 
 
 class TrackerInputs:
@@ -199,3 +200,33 @@ class TrackerInputs:
             return None
         mask = decode_mask(moment.messages['mask'], name, picture.shape[:2])
         return np.where(hidden_pixels(mask, self._params['robot_mask']), mask, 0)
+
+
+def drawn_in(request: SelectObjects.Request) -> list[np.ndarray]:
+    """Return the outlines (N, 2) of a request; TrackingError for those that are none."""
+    drawn = [np.array([(point.x, point.y) for point in polygon.points]).reshape(-1, 2)
+             for polygon in request.drawn]
+    if len(drawn) not in (0, len(request.names)) or not all(
+            np.isfinite(line).all() and len(line) not in (1, 2) for line in drawn):
+        raise TrackingError('drawn: expected no polygons, or one for each name, each empty or of '
+                            'three points and more, which are finite numbers')
+    return drawn
+
+
+def accepted(tracker: Tracker, view: View, clicks: np.ndarray,
+             drawn: Sequence[np.ndarray]) -> tuple[list[int], dict[int, TrackingError]]:
+    """Return which clicks are on objects, and why others are refused; TrackingError for all."""
+    why: dict[int, TrackingError] = {}
+    for k in range(len(clicks)):
+        try:
+            tracker.select(view, clicks[[k]], *picked(drawn, [k]))
+        except TrackingError as error:
+            why[k] = error
+    if len(why) == len(clicks):
+        raise next(iter(why.values()))
+    return [k for k in range(len(clicks)) if k not in why], why
+
+
+def picked(drawn: Sequence[np.ndarray], kept: Sequence[int]) -> tuple[list[np.ndarray], ...]:
+    """Return what select is given beside clicks: some trackers know no outlines."""
+    return ([drawn[k] for k in kept],) if drawn else ()

@@ -22,7 +22,7 @@ from tap_ros.messages.images import is_empty
 from tap_ros.messages.objects import decode_objects, MAX_OBJECTS
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE
-from tap_ros.nodes.tracker.inputs import TrackerInputs
+from tap_ros.nodes.tracker.inputs import accepted, drawn_in, picked, TrackerInputs
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.ros.calls import answering, log_error
 from tap_ros.ros.observations import Moment
@@ -131,12 +131,7 @@ class TrackerNode(Node):
             raise TrackingError(
                 f'names, u and v have {len(request.names)}, {len(request.u)} and '
                 f'{len(request.v)} entries; expected as many of each, 1 to {MAX_OBJECTS}')
-        drawn = [np.array([(point.x, point.y) for point in polygon.points]).reshape(-1, 2)
-                 for polygon in request.drawn]
-        if len(drawn) not in (0, len(request.names)) or not all(
-                np.isfinite(line).all() and len(line) not in (1, 2) for line in drawn):
-            raise TrackingError('drawn: expected no polygons, or one for each name, each empty or '
-                                'of three points and more, which are finite numbers')
+        drawn = drawn_in(request)
         found, clicks = decode_objects(encode_objects(
             request.names, np.column_stack([request.u, request.v]), None, 0, '',
             ObjectStates.SOURCE_TRACKED), 'select_objects', view.image.shape[:2])
@@ -148,10 +143,10 @@ class TrackerNode(Node):
                 f'{others} other nodes publish on {self.resolve_topic_name("objects")}; end '
                 'them, or start the simulator with objects:=tracked')
         tracker: Tracker = self._make(camera)
-        kept, why = _accepted(tracker, view, clicks, drawn)
+        kept, why = accepted(tracker, view, clicks, drawn)
         refused = [f'{escaped(name)}: {why[k]}' for k, name in enumerate(found) if k in why]
         found = tuple(found[k] for k in kept)
-        tracked = tracker.select(view, clicks[kept], *_picked(drawn, kept))
+        tracked = tracker.select(view, clicks[kept], *picked(drawn, kept))
         said = '; '.join([f'following {listing(found)}', *refused])
         message = self._encode(found, tracked, plane, moment.messages['image'].header)
         self._selection = Selection(
@@ -325,25 +320,6 @@ class TrackerNode(Node):
             header.frame_id if plane is None else WORLD_FRAME, ObjectStates.SOURCE_TRACKED)
         message.states, message.confidence = tracked.states, list(map(float, tracked.confidence))
         return message
-
-
-def _accepted(tracker: Tracker, view: View, clicks: np.ndarray,
-              drawn: Sequence[np.ndarray]) -> tuple[list[int], dict[int, TrackingError]]:
-    """Return which clicks are on objects, and why others are refused; TrackingError for all."""
-    why: dict[int, TrackingError] = {}
-    for k in range(len(clicks)):
-        try:
-            tracker.select(view, clicks[[k]], *_picked(drawn, [k]))
-        except TrackingError as error:
-            why[k] = error
-    if len(why) == len(clicks):
-        raise next(iter(why.values()))
-    return [k for k in range(len(clicks)) if k not in why], why
-
-
-def _picked(drawn: Sequence[np.ndarray], kept: Sequence[int]) -> tuple[list[np.ndarray], ...]:
-    """Return what select is given beside clicks: some trackers know no outlines."""
-    return ([drawn[k] for k in kept],) if drawn else ()
 
 
 @dataclass(frozen=True)
