@@ -38,7 +38,7 @@ PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threa
 # by 2 cm as it is lifted; chosen in scenes 900000 to 900003, which do not count.
 REACHED = {'push-wall-v3': 3.5}
 USUAL = 2.0  # elsewhere, chosen in scenes 1000000 to 1000005, which do
-DRAWN = 'direct', 'subgoal'
+ENDS = 'direct', 'subgoal', 'retrieval', 'places'  # that are drawn
 FILM_SIZE, FRAME_MS, HOLD_MS = 256, 120, 3000  # pixels; of each picture, of the last one
 STRIPS = 6  # scenes of each task whose actions and subgoals are kept, to draw them
 SCALE = 2  # of pictures that are drawn
@@ -144,32 +144,37 @@ def _act(world, method, seed, weights):
     return distance, [first.image, last.image], []
 
 
-def _kept(task, seed, folder):
-    """Return what is kept of a scene by the methods DRAWN; None where one is missing."""
-    paths = [Path(folder, f'{method}_{seed}.npz') for method in DRAWN]
+def _kept(task, seed, folder, methods):
+    """Return what is kept of a scene by methods; None where one is missing."""
+    paths = [Path(folder, f'{method}_{seed}.npz') for method in methods]
     return [np.load(path) for path in paths] if all(map(Path.exists, paths)) else None
 
 
 def draw_strip(task, seed, folder):
     """
-    Draw a scene: where it ends directly; the start, what was predicted, the end; the goal.
+    Draw a scene: the start, what is predicted, the ends of ENDS, the goal.
 
     :return: list of pictures, None if they are not kept.
     """
-    kept = _kept(task, seed, folder)
+    kept = _kept(task, seed, folder, ENDS)
     if kept is None:
         return None
     world = _world(task, IMAGE_SIZE)
     world.reset(seed)
-    direct, subgoal = (each['shown'] for each in kept)
-    return [enlarge(picture, SCALE) for picture in (direct[-1], *subgoal, world.goal().image)]
+    shown = [each['shown'] for each in kept]
+    return [enlarge(picture, SCALE) for picture in (
+        *shown[ENDS.index('subgoal')][:-1], *(pictures[-1] for pictures in shown),
+        world.goal().image)]
 
 
-def film(task, seed, folder):
-    """Return an animated WebP of a scene that is kept: left directly, right via the subgoals."""
+def film(task, seed, folder, methods):
+    """Return an animated WebP of a scene, methods that are kept side by side; None as above."""
+    kept = _kept(task, seed, folder, methods)
+    if kept is None:
+        return None
     world = _world(task, FILM_SIZE)
     films = [[world.reset(seed).image, *(world.step(action).image for action in each['actions'])]
-             for each in _kept(task, seed, folder)]
+             for each in kept]
     length = max(map(len, films))
     first, *others = (Image.fromarray(np.hstack([one[min(t, len(one) - 1)] for one in films]))
                       for t in range(length))
