@@ -212,7 +212,8 @@ def test_a_goal_of_another_client_is_seen_and_can_be_cancelled(explored):
         try:
             count = told()['events']
             ask(*5 * [{'do': 'predict'}], {'do': 'cancel'})  # at once, whatever is waited for
-            assert reaching.result().end == 'cancelled' and told()['events'] <= count + 1
+            assert reaching.result().end == 'cancelled'
+            assert told()['events'] < count + 5, 'it did not wait for the predictions'
         finally:
             predictor.send(signal.SIGCONT)
         told(lambda now: not now['run']['running'])
