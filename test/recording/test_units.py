@@ -25,7 +25,8 @@ def told(t, period, topic='/arm/control_period'):
     ([], [1, 1, 1]), ([(0.5, 0.25)], [0.25] * 3), ([(0.5, 0.5)], [0.5] * 3),
     ([(2.6, 0.1)], [0.1] * 3),  # a planner that starts when the arm was moved by hand before
     ([(0.5, 0.25), (2.6, 0.5)], [0.25, 0.25, 0.5]),
-    ([(0.5, float('nan'))], [CONTROL_PERIOD] * 3), ([(0.5, -1.0), (2.5, 0.5)], [0.5] * 3)])
+    ([(0.5, float('nan'))], [CONTROL_PERIOD] * 3), ([(0.5, 0.5), (2.5, 250.0)], [0.5] * 3),
+    ([(0.5, 0.5), (2.5, 1e-300)], [0.5] * 3), ([(0.5, -1.0), (2.5, 0.5)], [0.5] * 3)])
 def test_commands_are_multiplied_by_the_time_that_is_told(tmp_path, statements, seconds):
     messages = [mark(1, 0), *(camera(t) for t in (1, 2, 3, 4)), *(
         command(t, 0.1 * t, log=t + 0.1) for t in (1, 2, 3)), mark(4, 1, 'success'),
@@ -34,7 +35,7 @@ def test_commands_are_multiplied_by_the_time_that_is_told(tmp_path, statements, 
     (episode,), warned = read(bag)
     np.testing.assert_allclose(
         episode.actions[:, 0], [*np.multiply(seconds, [0.1, 0.2, 0.3]), 0], rtol=1e-6)
-    assert len(warned) == sum(not period > 0 for _, period in statements)
+    assert len(warned) == sum(not 0.001 <= period <= 10 for _, period in statements)
     assert all('/arm/control_period' in line for line in warned)
 
 
