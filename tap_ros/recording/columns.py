@@ -41,6 +41,7 @@ NAMES = (*PICTURES, *list(WIDTHS)[1:], 'mark')
 _GOALS = ('goal', 'goal_mask', 'goal_object')
 _CUTTING = ('twist', 'command', 'mark')  # without one of them an episode is no longer known
 _NEAR = 8  # pictures
+_PERIODS = 0.001, 10.0  # s, of control periods that are believed
 _MAX_BYTES = 2**20  # of a message that is no picture
 Mark = tuple[str, int, str]  # task, seed, outcome
 
@@ -53,7 +54,7 @@ class Columns:
     arrays: <name> (N, 4) int64 log time, stamp (0: none), place in the file, and an index: row of
         the pictures (-1: empty), number of the names of objects, or event of a mark; and
         frame_values (N, 1) float64 checksum of the message
-        twist_values (N, 3) float64 linear; period_values (N, 1) s, above 0, by which they are
+        twist_values (N, 3) float64 linear; period_values (N, 1) s, of _PERIODS, by which they are
         multiplied; command_values (N, 1) gripper opening
         joint_values (N, 4) gripper state, NaN where unknown
         arm_values (N, MOST_JOINTS) rad, of an arm where the gripper's place is not told
@@ -312,8 +313,8 @@ class _Decoder:
                   (linear.x, linear.y, linear.z))
 
     def _period(self, name: str, log: int, message: Any) -> None:
-        if not 0 < message.data < np.inf:
-            raise RecordingError(f'a control period of {message.data} s')
+        if not _PERIODS[0] <= message.data <= _PERIODS[1]:
+            raise RecordingError(f'a control period of {message.data:g} s')
         self._add(name, log, 0, 0, (message.data,))
 
     def _joints(self, name: str, log: int, message: Any) -> None:

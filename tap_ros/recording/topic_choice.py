@@ -21,7 +21,15 @@ from tap_ros.base.errors import ImageError, RecordingError
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import decode_positions, PLACE
-from tap_ros.messages.topics import BY_COLUMNS, IMAGE, JOINT_STATES, Topic, TOPICS
+from tap_ros.messages.topics import (
+    BY_COLUMNS,
+    CONTROL_PERIOD,
+    IMAGE,
+    JOINT_STATES,
+    Topic,
+    TOPICS,
+    TWIST,
+)
 from tap_ros.recording.columns import first_size
 from tap_ros.recording.defects import describe
 from tap_ros.recording.mcap_file import Channel, McapFile
@@ -92,9 +100,13 @@ class Bag:
                             file.counts().values())), f'{self.source}: holds no message')
             raise RecordingError(why)
         camera, doubts = self._camera(image_topic), list[str]()
-        topics = {camera: IMAGE.becomes} | {
-            topic: name for name, one in BY_COLUMNS.items() if one is not IMAGE
-            for topic in self._beside(one, camera, doubts)}
+        topics, near = {camera: IMAGE.becomes}, camera
+        for name, one in BY_COLUMNS.items():
+            if one is CONTROL_PERIOD:  # of the commands, whatever the namespace of the camera
+                near = next((topic for topic in topics if topics[topic] == TWIST.becomes), camera)
+            if one is not IMAGE:
+                topics |= dict.fromkeys(self._beside(one, near, doubts), name)
+            near = camera
         for channel in self._every:
             if channel.topic not in topics or channel.type_name not in self._types(channel.topic):
                 continue
@@ -215,15 +227,21 @@ class Bag:
                     and self._is_usable(other))
 
     def _beside(self, one: Topic, camera: str, doubts: list[str]) -> list[str]:
-        """Return the topics that are read as one of ours, beside a camera."""
+        """Return the topics that are read as one of ours, beside a camera or the commands."""
         found = [topic for topic, channel in self.channels.items()
-                 if channel.type_name in one.types and _named_best(topic) is one
-                 and self._counts.get(topic) != 0]
+                 if channel.type_name in one.types and _named_best(topic) is one]
+        held = [topic for topic in found if self._counts.get(topic) != 0]
+        # Later files of a bag tell that there was a period, in m/s, which the first one holds.
+        found = held or (found if one is CONTROL_PERIOD else [])
         found = [topic for topic in found if _plain(topic) == topic or _plain(topic) not in found]
         above = [topic for topic in found
                  if camera.startswith(_plain(topic).removesuffix(one.name))]
         if above or len(found) < 2:
             return sorted(above, key=len)[-1:] or found
+        if one is CONTROL_PERIOD:
+            doubts.append(f'several topics could be {one.recorded}: {self._listing(found)}; what '
+                          'any of them told last is taken')
+            return found
         if one is JOINT_STATES:
             told = {topic: next(map(decode_positions, self._first(topic)), {}) for topic in found}
             places = [topic for topic, names in told.items()

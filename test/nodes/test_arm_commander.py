@@ -4,10 +4,12 @@
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
-from processes import Client, Newest
+from processes import Client, Newest, until
 import pytest
 from rclpy.parameter import Parameter
+from std_msgs.msg import Float64
 from tap_ros.base.contract import ACTION_LIMIT, SPEED_LIMIT
+from tap_ros.base.errors import ConfigError
 from tap_ros.nodes.planner.arm import ArmCommander
 from tap_ros.nodes.planner.settings import declare_parameters, step_limits
 from tap_ros.planning.action_sequences import SequenceShape, SIZE
@@ -58,3 +60,19 @@ def test_no_action_is_faster_than_the_limits_whatever_the_control_period(command
         assert (np.abs(sent) * period <= np.array(ACTION_LIMIT) + 1e-9).all()
     planned = SequenceShape(step_limits(params)).clip(np.full((1, SIZE), 1e30))
     np.testing.assert_allclose(planned[0, 0] / period, sent[0], err_msg='the planner knows it')
+
+
+def test_what_the_planner_says_itself_hides_no_other_time_that_the_arm_has_told():
+    with Client() as node:
+        params = declare_parameters(node)
+        arm = ArmCommander(node, params, Observations('image'))
+        assert until(lambda: arm._echoed)
+        for first, later in ((0.5, 0.25), (0.25, 0.5)):  # they may come in any order
+            arm._period, arm._echoed = 0.25, False
+            arm._on_period(Float64(data=first))
+            arm._on_period(Float64(data=later))
+            with pytest.raises(ConfigError, match=r'the arm takes 0\.5 s'):
+                arm.begin(object())
+        arm._on_period(Float64(data=0.25))  # the arm was started anew
+        arm.begin(object())
+        arm.close(1.0)

@@ -115,6 +115,16 @@ def test_an_arm_that_takes_another_time_for_a_command_is_not_moved(rig):
     assert moves == 1
 
 
+def test_an_arm_that_comes_to_take_another_time_for_a_command_is_moved_no_more(rig):
+    arm = rig.client.node.create_publisher(Float64, 'arm/control_period', LATCHED)
+    assert until(arm.get_subscription_count)
+    result, moves = rig.reach(40, lambda _: arm.publish(Float64(data=0.5)))
+    assert result.end == 'aborted' and 'the arm takes 0.5 s' in result.message, result.message
+    assert 1 <= moves < 40
+    arm.publish(Float64(data=0.25))
+    assert until(lambda: rig.planner.node._arm._period == 0.25)
+
+
 def test_joints_of_another_time_than_the_picture_move_nothing(rig):
     rig.world.late_s = 5.0
     rig.aborted('older than the picture')

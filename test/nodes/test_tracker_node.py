@@ -170,6 +170,10 @@ def test_an_object_can_be_drawn(scene):
     assert max(across) - min(across) == pytest.approx(18, abs=2)
     with pytest.raises(CallError, match='drawn: expected'):
         scene.client.call('select', names=[name], u=[u], v=[v], drawn=[box, box])
+    scribble = Polygon(points=[Point32(x=float(17 * k % 61), y=float(29 * k % 59))
+                               for k in range(1001)])
+    with pytest.raises(CallError, match='drawn: expected 1000 points at most'):
+        scene.client.call('select', names=[name], u=[u], v=[v], drawn=[scribble])
 
 
 class Eye:

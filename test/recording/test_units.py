@@ -4,7 +4,7 @@
 
 from pathlib import Path
 
-from made_bags import camera, command, mark, read, record, SECOND
+from made_bags import camera, command, mark, read, record, SECOND, write_mcap
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -25,7 +25,8 @@ def told(t, period, topic='/arm/control_period'):
     ([], [1, 1, 1]), ([(0.5, 0.25)], [0.25] * 3), ([(0.5, 0.5)], [0.5] * 3),
     ([(2.6, 0.1)], [0.1] * 3),  # a planner that starts when the arm was moved by hand before
     ([(0.5, 0.25), (2.6, 0.5)], [0.25, 0.25, 0.5]),
-    ([(0.5, float('nan'))], [CONTROL_PERIOD] * 3), ([(0.5, -1.0), (2.5, 0.5)], [0.5] * 3)])
+    ([(0.5, float('nan'))], [CONTROL_PERIOD] * 3), ([(0.5, 0.5), (2.5, 250.0)], [0.5] * 3),
+    ([(0.5, 0.5), (2.5, 1e-300)], [0.5] * 3), ([(0.5, -1.0), (2.5, 0.5)], [0.5] * 3)])
 def test_commands_are_multiplied_by_the_time_that_is_told(tmp_path, statements, seconds):
     messages = [mark(1, 0), *(camera(t) for t in (1, 2, 3, 4)), *(
         command(t, 0.1 * t, log=t + 0.1) for t in (1, 2, 3)), mark(4, 1, 'success'),
@@ -34,8 +35,25 @@ def test_commands_are_multiplied_by_the_time_that_is_told(tmp_path, statements, 
     (episode,), warned = read(bag)
     np.testing.assert_allclose(
         episode.actions[:, 0], [*np.multiply(seconds, [0.1, 0.2, 0.3]), 0], rtol=1e-6)
-    assert len(warned) == sum(not period > 0 for _, period in statements)
+    assert len(warned) == sum(not 0.001 <= period <= 10 for _, period in statements)
     assert all('/arm/control_period' in line for line in warned)
+
+
+@pytest.mark.parametrize('periods, expected', [
+    ([], 1.0),  # an older recording
+    ([('/arm/control_period', None)], CONTROL_PERIOD),  # the file of a bag behind its first one
+    ([('/arm/control_period', 0.25), ('/left/arm/control_period', 0.5)], 0.5),
+    ([('/arm/control_period', 0.25), ('/left/arm/control_period', None)], 0.25),
+    ([('/a/arm/control_period', 0.25), ('/b/arm/control_period', 0.5)], 0.5)])
+def test_the_time_is_that_of_the_commands_and_never_overlooked(tmp_path, periods, expected):
+    messages = [mark(1, 0), *(told(0.5 + k / 10, period, topic) for k, (topic, period) in
+                              enumerate(periods) if period), *(camera(t) for t in (1, 2)), *(
+        (f'/left{topic}', *rest) for topic, *rest in [command(1, 0.1, log=1.1)]),
+        mark(2, 1, 'success')]
+    path = write_mcap(tmp_path / 'a.mcap', sorted(messages, key=lambda one: one[3]),
+                      [(topic, FLOAT) for topic, _ in periods])
+    (episode,), _ = read(path)
+    np.testing.assert_allclose(episode.actions[0, 0], 0.1 * expected, rtol=1e-6)
 
 
 def test_an_older_recording_written_anew_gives_the_same_actions(tmp_path):

@@ -12,6 +12,7 @@ from geometry_msgs.msg import TwistStamped
 import numpy as np
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 from tap_ros.base.errors import PlanningError
 from tap_ros.base.text import escaped
@@ -50,7 +51,9 @@ class ArmCommander:
             node.create_publisher(Float64, f'arm/{name}', LATCHED).publish(
                 Float64(data=params[name]))
         self._period = params['control_period']  # as the arm says, or as it is told
-        node.create_subscription(Float64, CONTROL_PERIOD.name, self._on_period, LATCHED)
+        self._echoed = False  # what this node itself says has come, before or after the arm's
+        node.create_subscription(Float64, CONTROL_PERIOD.name, self._on_period, QoSProfile(
+            depth=10, durability=LATCHED.durability))  # else one hides another that came before
         self._closed = False
         self._thread = threading.Thread(target=self._watch, name='arm watch', daemon=True)
         self._thread.start()
@@ -96,7 +99,9 @@ class ArmCommander:
         :return: whether it was sent; not when the goal has ended or a sensor is silent.
         :raises PlanningError: for numbers that are not finite, and after this process stood still:
             messages received then may be old.
+        :raises ConfigError: when the arm takes another time for a command by now.
         """
+        check_period(self._params, self._period)
         if not np.isfinite(action).all():
             raise PlanningError(f'the planner chose {action}; expected finite numbers')
         params = self._params
@@ -133,7 +138,9 @@ class ArmCommander:
         self._twist.wait_for_all_acked(Duration(seconds=seconds))
 
     def _on_period(self, message: Float64) -> None:
-        if 0 < message.data < math.inf:
+        if not self._echoed and message.data == self._params['control_period']:
+            self._echoed = True
+        elif 0 < message.data < math.inf:
             self._period = message.data
 
     def _watch(self) -> None:

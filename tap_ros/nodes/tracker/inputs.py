@@ -31,6 +31,7 @@ from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, STREAM
 from tap_ros.tracking.plane import check_pose, Plane
 from tap_ros.tracking.protocols import Tracker, View
 
+MOST_POINTS = 1000  # of an outline; OpenCV fills one of 100 000 for minutes
 
 class TrackerInputs:
     """
@@ -204,6 +205,8 @@ class TrackerInputs:
 
 def drawn_in(request: SelectObjects.Request) -> list[np.ndarray]:
     """Return the outlines (N, 2) of a request; TrackingError for those that are none."""
+    if any(len(polygon.points) > MOST_POINTS for polygon in request.drawn):
+        raise TrackingError(f'drawn: expected {MOST_POINTS} points at most of an outline')
     drawn = [np.array([(point.x, point.y) for point in polygon.points]).reshape(-1, 2)
              for polygon in request.drawn]
     if len(drawn) not in (0, len(request.names)) or not all(
