@@ -128,6 +128,23 @@ def test_no_bag_is_overwritten_and_each_has_the_goal_and_the_cards(client, recor
             bytes(random_image(stamp).data) for stamp in pictures]
 
 
+def test_the_time_that_the_arm_tells_is_recorded_beside_whatever_is_asked_for(
+        client, record, tmp_path):
+    joints = client.create_publisher(JointState, 'elsewhere/joints', STREAM)
+    period = client.create_publisher(Float64, 'arm/control_period', LATCHED)
+    period.publish(Float64(data=0.5))
+    node = record(topics=['elsewhere/joints'])
+    assert until(joints.get_subscription_count)
+    arrived(period)
+    joints.publish(JointState(name=['a'], position=[1.5]))
+    arrived(joints)
+    assert until(lambda: node.node._bags.count == 2)
+    assert node.end() == 0
+    told = [message.data for topic, _, message in read(tmp_path / 'bag')
+            if topic == '/arm/control_period']
+    assert told == [0.25, 0.5]  # the newest holds
+
+
 def test_topics_of_any_type_can_be_recorded_beside_where_the_arm_stands_and_its_time(
         client, record, tmp_path):
     joints = client.create_publisher(JointState, 'elsewhere/joints', STREAM)

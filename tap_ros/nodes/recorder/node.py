@@ -186,11 +186,13 @@ class RecorderNode(Node):
         if not self._wanted:
             raise ConfigError('parameter topics: is empty; name at least one topic')
         streams = {name for name in self._wanted if (known := _known(name)) and known.periodic}
+        period = self.resolve_topic_name(CONTROL_PERIOD.name)
         self._diagnostics = Diagnostics(
-            self, streams, set(self._wanted) - streams,
+            self, streams, {*self._wanted, period} - streams,
             expected=self._wanted if self.params['topics'] != [*BY_NAME] else ())
-        self._bags = Bags(self.params, self._report,
-                          self.resolve_topic_name(CONTROL_PERIOD.name))
+        if period not in map(self.resolve_topic_name, self._wanted):
+            self._wanted = [*self._wanted, period]  # what the arm tells goes before the parameter
+        self._bags = Bags(self.params, self._report, period)
         if self.params['record_on_start']:
             self._bags.start()
         self._subscribe_known()
