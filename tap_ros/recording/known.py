@@ -14,7 +14,7 @@ from typing import Any
 from tap_ros.base.errors import RecordingError
 from tap_ros.recording.raw_files import bytes_of, parts_of, stats_of
 
-FORMAT = 10  # of the cache; another number makes all files be decoded again
+FORMAT = 11  # of the cache; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _SETTLED_NS = 2 * 10**9  # a file changed later may change again and show the same time
 
