@@ -110,8 +110,10 @@ def test_rows_are_means_over_scenes_and_say_how_sure_the_gain_is():
         'order2', '3', '6.3', '3.0']
     assert [gains(one) for one in scenes] == [True, True, False]
     assert list(shown(scenes[::-1])) == [
-        'order2 7: of 2 scenes that succeed only via the subgoal the one that ends furthest from '
-        'the goal directly']
+        'order2 7: the first scene that succeeds via the subgoal and ends 10 cm off or more '
+        'directly']
+    assert list(shown(scenes[:0:-1])) == [
+        'order2 8: the first scene of this task that succeeds only via the subgoal']
 
 
 def test_the_page_is_one_file_with_everything_inside(tmp_path):

@@ -27,7 +27,7 @@ from rclpy.parameter import Parameter
 from tap_ros.apps.demo.film import film, Scene
 from tap_ros.apps.demo.report import (
     as_row,
-    gains,
+    gains_clearly,
     MODES,
     results_table,
     shown,
@@ -180,7 +180,7 @@ def run(args: Options) -> int:
             print(f'  {task} {seed}   left out: {scene}', flush=True)
             continue
         scenes.append(scene)
-        if gains(scene):
+        if gains_clearly(scene):
             filmed.add(task)
         print(f'  {task} {seed}   ' + '   '.join(
             f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps'

@@ -36,7 +36,7 @@ class Row(NamedTuple):
                 '{:+.1f} ({:+.1f} to {:+.1f})'.format(*self.nearer), *share,
                 '{:+.0f} ({:+.0f} to {:+.0f})'.format(*self.more)]
 
-
+CLEARLY = 0.1  # m from its goal, directly: no near miss
 COLUMNS = ('task', 'scenes', 'final cm, direct', 'via', 'nearer by', 'success, direct', 'via',
            'more by, points')
 
@@ -104,24 +104,33 @@ def shown(scenes: Sequence[Scene]) -> dict[str, Scene]:
     """
     Return of which scene of each task a film is shown, by its caption.
 
-    Of those that succeed via the subgoal alone it is the one that ends furthest from the goal
-    directly; the first of all if none does.
+    It is the first one that fails clearly directly and succeeds via the subgoal; without one the
+    first that succeeds via the subgoal alone, and the first of all if none does.
     """
     found = {}
     for task, group in groupby(scenes, lambda scene: scene.task):
         first, *others = group
-        gaining = [one for one in (first, *others) if gains(one)]
-        scene = max(gaining, default=first,
-                    key=lambda one: float(one.runs['direct'].distances[-1].max()))
-        found[f'{task} {scene.seed}: ' + (
-            f'of {len(gaining)} scenes that succeed only via the subgoal the one that ends '
-            'furthest from the goal directly' if gaining else 'the first scene')] = scene
+        caption, scene = next(
+            ((words, one) for words, fits in FILMED.items() for one in (first, *others)
+             if fits(one)), ('the first scene', first))
+        found[f'{task} {scene.seed}: {caption}'] = scene
     return found
 
 
 def gains(scene: Scene) -> bool:
     """Tell whether a scene succeeds via the subgoal alone."""
     return scene.runs['subgoal'].reached and not scene.runs['direct'].reached
+
+
+def gains_clearly(scene: Scene) -> bool:
+    """Tell whether besides an object is far from its goal after the direct run."""
+    return gains(scene) and bool(scene.runs['direct'].distances[-1].max() > CLEARLY)
+
+
+FILMED = {  # of a scene that fits, the first kind first
+    f'the first scene that succeeds via the subgoal and ends {100 * CLEARLY:.0f} cm off or more '
+    'directly': gains_clearly,
+    'the first scene of this task that succeeds only via the subgoal': gains}
 
 
 def _stills(scene: Scene) -> Iterator[tuple[str, str]]:
