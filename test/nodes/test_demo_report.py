@@ -32,7 +32,14 @@ from tap_ros.apps.demo.film import (
     SIDE,
     START_MS,
 )
-from tap_ros.apps.demo.report import gains, results_table, shown, summary, write_report
+from tap_ros.apps.demo.report import (
+    gains,
+    in_words,
+    results_table,
+    shown,
+    summary,
+    write_report,
+)
 from tap_ros.apps.demo.watch import right_order, Watch
 from tap_ros.base.contract import CAMERA_SIZE
 from tap_ros.base.errors import TapError
@@ -106,6 +113,8 @@ def test_rows_are_means_over_scenes_and_say_how_sure_the_gain_is():
     assert row.nearer.low == pytest.approx(0) and row.nearer.high == pytest.approx(8)
     task, together = summary([*scenes, scene(7, 0.03, 'order3')])[::2]
     assert (task.scenes, together.scenes) == (3, 4)
+    one, = summary(scenes[:1])
+    assert one.texts()[4] == '+8.0' and in_words(one).startswith('One scene, which proves nothing')
     assert results_table(summary(scenes)).splitlines()[2].split()[:4] == [
         'order2', '3', '6.3', '3.0']
     assert [gains(one) for one in scenes] == [True, True, False]

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tap_ros.base.plugins import load_plugin, names
+from tap_ros.base.plugins import BUILT_IN, load_plugin
 from tap_ros.base.search import cross_entropy
 from tap_ros.planning.protocols import Problem, SearchConfig
 from tap_ros.planning.solvers.icem import icem
 
 TARGET = np.array([0.3, -0.7, 0.2])
 solvers = pytest.mark.parametrize('solver', [
-    load_plugin('tap_ros.solvers', name) for name in names('tap_ros.solvers')])
+    load_plugin('tap_ros.solvers', name) for name in BUILT_IN['tap_ros.solvers']])
 
 
 def quadratic(samples):

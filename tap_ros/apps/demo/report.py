@@ -32,9 +32,12 @@ class Row(NamedTuple):
     def texts(self) -> list[str]:
         """Return the cells of a table."""
         share = [f'{100 * n / self.scenes:.0f}%' for n in self.reached]
+        nearer, more = '{:+.1f} ({:+.1f} to {:+.1f})', '{:+.0f} ({:+.0f} to {:+.0f})'
+        if self.scenes == 1:  # has no interval
+            nearer, more = '{:+.1f}', '{:+.0f}'
         return [self.label, str(self.scenes), *(f'{cm:.1f}' for cm in self.cm),
-                '{:+.1f} ({:+.1f} to {:+.1f})'.format(*self.nearer), *share,
-                '{:+.0f} ({:+.0f} to {:+.0f})'.format(*self.more)]
+                nearer.format(*self.nearer), *share, more.format(*self.more)]
+
 
 CLEARLY = 0.1  # m from its goal, directly: no near miss
 COLUMNS = ('task', 'scenes', 'final cm, direct', 'via', 'nearer by', 'success, direct', 'via',
@@ -62,6 +65,9 @@ def in_words(row: Row) -> str:
     """Say what came of some scenes."""
     direct, via = row.reached
     sure = 'its interval excludes zero' if row.nearer.low > 0 else 'which chance may explain'
+    if row.scenes == 1:
+        return (f'One scene, which proves nothing: objects end {row.nearer.value:+.1f} cm nearer '
+                'to their goals via the predicted subgoal.')
     return (f'Via the predicted subgoal {via} of {row.scenes} scenes succeed, directly {direct}; '
             f'objects end {row.nearer.value:.1f} cm nearer to their goals '
             f'({row.nearer.low:.1f} to {row.nearer.high:.1f}), {sure}.')

@@ -196,7 +196,7 @@ function showEvents() {
 // Buttons and keys
 
 function begin() {
-  send({do: 'reset', task: $('task').value, seed: Math.max(0, Math.round(Number($('seed').value)))});
+  send({do: 'reset', task: $('task').value, seed: Number($('seed').value)});
 }
 
 function on(id, command) {
