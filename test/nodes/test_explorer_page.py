@@ -136,7 +136,7 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
 def test_keys_and_a_screen_reader_reach_all_that_a_pointer_does(explorer, browser):
     with opened(browser, explorer.node.url) as page, Client('camera') as node:
         camera = Camera(node)
-        page.wait_for_function('pictures.camera && state.tracker')
+        page.wait_for_function('pictures.camera && state.tracker && state.camera.width')
         page.focus('#large')
         for key, times in (('Shift+ArrowLeft', 3), ('ArrowUp', 2), ('Enter', 1)):
             for _ in range(times):
