@@ -10,8 +10,8 @@ from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.base.engines import Engine
 from tap_ros.base.options import Flag, Folder, one_of, ShippedFile
 from tap_ros.base.plugins import names
-from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS
-from tap_ros.weights import FORWARD_MODEL
+from tap_ros.planning.mpc_config import PRESETS
+from tap_ros.weights import FORWARD_MODEL, PLANNING_TASKS
 from tyro import conf
 
 

@@ -18,7 +18,7 @@ import re
 
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.plugins import names
-from tap_ros.planning.mpc_config import PLANNING_TASKS
+from tap_ros.weights import PLANNING_TASKS
 
 FIRST_SCENE = 1_000_000  # seed of the scenes that are planned in, far from the recordings'
 STACKING_TASKS = ('stack3', 'stack2', 'pick_place')

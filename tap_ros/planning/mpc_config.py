@@ -11,7 +11,6 @@ from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.protocols import SearchConfig, Solver
 
 SWITCHES = ('reached', 'half')  # when to go on from a subgoal, see hierarchy.py
-PLANNING_TASKS = ('push2', 'push3', 'order2', 'order3')
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 """Starting and ending a node process, and how Fast DDS is set up for it."""
 
 from collections.abc import Callable, MutableMapping
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 import os
@@ -151,8 +152,9 @@ def configure_fast_dds(environ: MutableMapping[str, str] = os.environ) -> None:
 
 def _end_with_owner() -> None:
     """End this process as SIGTERM does once its owner, who holds its standard input, is gone."""
-    while os.read(sys.stdin.fileno(), 1024):
-        pass
+    with suppress(OSError):  # it is closed already
+        while os.read(0, 1024):
+            pass
     os.kill(os.getpid(), signal.SIGTERM)
 
 

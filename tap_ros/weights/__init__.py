@@ -12,8 +12,8 @@ _FOLDER = Path(__file__).parent
 FORWARD_MODEL = _FOLDER / 'forward_model_push.safetensors'
 PREDICTORS = {path.stem.removeprefix('predictor_'): path
               for path in sorted(_FOLDER.glob('predictor_*.safetensors'))}
-FORWARD_MODELS = dict.fromkeys(  # by its own name, and by the tasks that it is for
-    ('push', 'push2', 'push3', 'order2', 'order3'), FORWARD_MODEL)
+PLANNING_TASKS = ('push2', 'push3', 'order2', 'order3')  # that the forward model is for
+FORWARD_MODELS = dict.fromkeys(('push', *PLANNING_TASKS), FORWARD_MODEL)  # by name, and by task
 DEFAULT_PREDICTOR = 'push2'
 
 

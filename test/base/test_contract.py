@@ -15,9 +15,8 @@ from sim_bridge.world.table import ramp_controls
 from tap_ros.base import contract
 from tap_ros.planning.action_sequences import Limits, SequenceShape
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.planning.mpc_config import PLANNING_TASKS
 from tap_ros.recording.cache import open_recordings
-from tap_ros.weights import FORWARD_MODEL
+from tap_ros.weights import FORWARD_MODEL, PLANNING_TASKS
 import torch
 
 ROOT = Path(__file__).parents[2]
