@@ -39,13 +39,14 @@ get() {
   from=${ROS2_SOURCES:+$ROS2_SOURCES/$name} target=ros2/src/$name
   mkdir -p "$target"
   if [ -z "$from" ]; then
-    git clone --quiet --depth 1 --branch "$tag" "https://github.com/$repository" "$target.git"
+    git clone --quiet --depth 1 --branch "$tag" "https://github.com/$repository" "$target.git" ||
+      return
     from=$target.git
   fi
   if git -C "$from" rev-parse --quiet --verify "$tag^{commit}" >/dev/null; then
-    git -C "$from" archive "$tag" "$@" | tar x -C "$target"
+    git -C "$from" archive "$tag" "$@" | tar x -C "$target" || return
   else
-    for folder in "$@"; do cp -r "$from/$folder" "$target/"; done
+    for folder in "$@"; do cp -r "$from/$folder" "$target/" || return; done
   fi
   rm -rf "$target.git"
 }
@@ -54,7 +55,7 @@ get_all() {
   local repository
   for repository in "${repositories[@]}"; do
     # shellcheck disable=SC2086  # words
-    get $repository
+    get $repository || return  # set -e does not hold within step
   done
 }
 
