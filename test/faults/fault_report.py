@@ -27,15 +27,12 @@ MAX_REASONS = 4
 HEAD = """\
 # Faults
 
-Each row is a fault that was injected into real nodes, processes that talk over DDS, or into a
-disk. *Held*: trials in which what must happen did happen, and no node logged a traceback or an
-error that the fault does not explain. *Seen*: the worst of all trials unless said otherwise. Made
-by `{command}` in {minutes:.0f} minutes, {dates}, commit {commits},
-on {machines}; [faults.json](faults.json) has each row's.
+Each row is a fault that was injected into real nodes or a disk. *Held*: trials that ended as they
+must, without a traceback or an unexplained error in a log. *Seen*: the worst of all trials unless
+said otherwise. Made by `{command}` in {minutes:.0f} minutes, {dates}, commit {commits},
+on {machines}; data: [faults.json](faults.json).
 
-![slowest reaction of all trials, and what was promised](faults.png)
-
-*The slowest reaction (bars) and what was promised (lines).*
+![slowest reaction of all trials (bars), and what was promised (lines)](faults.png)
 
 | injected | must happen | held | seen |
 | --- | --- | ---: | --- |
