@@ -27,10 +27,11 @@ MAX_REASONS = 4
 HEAD = """\
 # Faults
 
-Each row is a fault that was injected into real nodes or a disk. *Held*: trials that ended as they
-must, without a traceback or an unexplained error in a log. *Seen*: the worst of all trials unless
-said otherwise. Made by `{command}` in {minutes:.0f} minutes, {dates}, commit {commits},
-on {machines}; data: [faults.json](faults.json).
+Each row is a fault that was injected into real nodes, during a goal unless it says otherwise, or
+into a disk. *Held*: trials that ended as they must, without a traceback or an unexplained error in
+a log. *Seen*: the worst of all trials unless said otherwise. Made by `{command}` in
+{minutes:.0f} minutes, {dates}, commit {commits}, on {machines}; data:
+[faults.json](faults.json).
 
 ![slowest reaction of all trials (bars), and what was promised (lines)](faults.png)
 
