@@ -194,7 +194,8 @@ def _line(injected, promise, rows):
     figures = [row['figure'] for row in rows if row['figure'] is not None]
     seen = ' / '.join(f'{figure:.3g}' if isinstance(figure, float) else figure
                       for figure in figures)
-    parts = [f'{seen} {rows[0]["what"]}'.strip() if figures else '',
+    what = re.sub(r'^s (?:until|for) [a-z ]+', 's ', rows[0]['what']).strip()  # 's (median)'
+    parts = [f'{seen} {what}'.strip() if figures else '',
              *(row['why_not'] for row in rows)]
     words = '; '.join(filter(None, parts)).replace('|', '\\|').replace('<', '\\<')
     share = f'{held} of {tried}'
