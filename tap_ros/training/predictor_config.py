@@ -44,6 +44,7 @@ class TrainingConfig(RunConfig):
         labels learned from 'marks' as a prior. fix with marks has its target at the label.
     :param marks: JSON file of demonstrations whose bottleneck a person has marked, see `mark`.
         Start and goal are then drawn around the label.
+    :param mark_name: train on the marks of this name alone, where a demonstration has several.
     :param label_weight: of log w(t) beside the l1 error, with selection marks; w(t) is how likely
         a frame is the label. 0: any of the likeliest frames alike.
     :param keyframes: the network is also given the labelled frame of the demonstration that is
@@ -104,6 +105,7 @@ class TrainingConfig(RunConfig):
     loss: Loss = 'genmin'
     selection: Selection = 'progress'
     marks: str = ''
+    mark_name: str = ''
     label_weight: float = 0.01
     keyframes: bool = False
     gan: bool = False
@@ -175,6 +177,9 @@ class TrainingConfig(RunConfig):
             raise ConfigError('keyframes: they are the frames that one mark labels, between a '
                               'start and a goal, and copied instead of new pixels; give --marks '
                               'and --no-new-pixels, and leave mode and recursion out')
+        if self.mark_name and (not self.marks or self.recursion > 1):
+            raise ConfigError('mark_name: it chooses one of the marks of a demonstration; give '
+                              '--marks, and leave recursion out')
         if self.recursion > 1 and self.loss == 'fix':
             raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
                               'loss fix')
