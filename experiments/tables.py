@@ -142,7 +142,8 @@ class Tables:
             paper = [TABLE_2[task, method][0] for method in ('direct', 'genmin')]
             less = final(task, 'shipped', 'final_distance_difference_cm', compares='direct')
             yield (f'final distance, {title} objects anywhere: direct; via the subgoal; '
-                   'difference (paper: {} cm; {} cm; {:.1f} cm)'.format(*paper, paper[1] - paper[0]), '',
+                   'difference (paper: {} cm; {} cm; {:.1f} cm)'.format(
+                       *paper, paper[1] - paper[0]), '',
                    '; '.join(number(row, 1, 1, ' cm') for row in (
                        final(task, 'direct'), final(task, 'shipped'), less)),
                    reached(less['ci_high'] < 0, 'nearer'))
