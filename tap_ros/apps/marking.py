@@ -116,8 +116,7 @@ class Marking:
         count = len(next(iter(marks.values())))
         height, width = self.store.camera_size or (1, 1)
         crop = [] if '--crop' in options or height == width else ['--crop', 'centre']
-        # Recursion has a mark for each level, and no keyframes.
-        how = ['--recursion', str(count)] if count > 1 else ['--keyframes', '--no-new-pixels']
+        how = ['--recursion', str(count)] * (count > 1) + ['--keyframes', '--no-new-pixels']
         return [shlex.join(['python', '-m', 'tap_ros', *words]) for words in (
             ['label', *both, *_only(options, '--image-topic'), '--out', f'labels/{name}'],
             ['train', 'predictor', *both, *options, *crop, '--size', '64', *how,

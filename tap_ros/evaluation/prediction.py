@@ -198,7 +198,10 @@ def ask(network: PredictorNetwork | Predictor, batch: Batch,
     if size:
         z = draw_latents(episodes, 1, size)[:, 0].to(device)
     prediction = network(to_float(batch.context).to(device), z)
-    return prediction.image, lambda b, pixels: predicted_maps(pixels, prediction, b)
+    alike = [0] * len(batch.context) if network.bank is None else network.bank.find(
+        batch.context.cpu().numpy())[0].tolist()
+    return prediction.image, lambda b, pixels: predicted_maps(
+        pixels, prediction, b, network.bank, alike[b])
 
 
 def draw_latents(episodes: Iterable[int], count: int, size: int) -> torch.Tensor:

@@ -103,11 +103,12 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
     if that does not help, it is the mask-weighted mixture of the maps where they were, and
     if the masks hide these too, their plain mean.
 
-    :param maps: (B, C, K, H, W), maps in each context picture, each summing to 1.
+    :param maps: (B, C, K, H, W), maps in each context picture, each summing to 1; those of start
+        and goal. In a keyframe of another demonstration also 0: nothing is known of the object.
     :param flow: (B, C or more, 2, H, W) in pixels.
     :param masks: (B, C or more, 1, H, W). What comes after the first C is left out: new pixels
-        have no origin, and in a keyframe of another demonstration the objects are not known. The
-        mass tells how much of an object is copied from there.
+        have no origin, and where objects are in a keyframe may not be known. The mass tells how
+        much of an object is copied from where it is known.
     :return: WarpedMaps.
     """
     flow, masks = flow[:, :maps.shape[1]], masks[:, :maps.shape[1]]

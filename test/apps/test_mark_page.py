@@ -229,7 +229,8 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
                      '--out', 'labels/squares']
     assert train[3:] == ['train', 'predictor', str(bag), '--marks', 'my marks.json', '--rate',
                          '4', '--crop', 'centre', '--size', '64', '--recursion', '2',
-                         '--test-fraction', '0.25', '--threads', '1', '--out', 'runs/squares']
+                         '--keyframes', '--no-new-pixels', '--test-fraction', '0.25',
+                         '--threads', '1', '--out', 'runs/squares']
     one = Marking(store, [str(bag)], tmp_path / 'one.json', ['grasp'])
     for i in range(2):
         one.mark(i, [3])
