@@ -130,9 +130,8 @@ class SubgoalPredictor(Predictor):
             shown = np.repeat(numbers, counts)
             context = bank.beside(context, shown)
             sources = [[*pictures, bank.keyframes[i]] for pictures, i in zip(sources, shown)]
-        maps = _join([  # rows, C, K, H, W
-            one_hot_maps(torch.from_numpy(pixels).to(self._device), self.image_size).expand(
-                N, -1, -1, -1, -1) for N, (_, pixels) in zip(counts, scenes)])
+        places = np.repeat([pixels for _, pixels in scenes], counts, 0)  # rows, C, K, 2
+        maps = one_hot_maps(torch.from_numpy(places).to(self._device), self.image_size)
         levels: list[list[list[Subgoal]]] = [[] for _ in requests]
         for level in range(1, max(request.recursion_depth for request in requests) + 1):
             # Those that go on are the first rows, since the deepest come first.
