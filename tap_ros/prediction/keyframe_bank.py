@@ -171,13 +171,13 @@ class KeyframeBank:
         keyframes = self.scaled(tuple(context.shape[-2:]))[self.numbers(indices, level)]
         return torch.cat([context, to_float(keyframes).to(context.device)[:, None]], 1)
 
-    def beside_maps(self, maps: torch.Tensor, asked: Sequence[np.ndarray], indices: np.ndarray,
+    def beside_maps(self, maps: torch.Tensor, asked: np.ndarray, indices: np.ndarray,
                     level: int = 1) -> torch.Tensor:
         """
         Add where objects are in the keyframes; those of which nothing is known are nowhere.
 
         :param maps: (B, 2, K, H, W), in start and goal.
-        :param asked: B times (K, 2), (u, v) in the start; see retrieval.places_then.
+        :param asked: (B, K, 2), (u, v) in the start; see retrieval.places_then.
         :param indices: demonstrations (B,).
         :return: (B, 3, K, H, W); the same as given where nothing is known.
         """

@@ -128,10 +128,8 @@ class SubgoalPredictor(Predictor):
             said = [{'distance': distance, 'warning': bank.unlike(distance)}
                     for distance in distances.tolist()]
             alike = np.repeat(alike, counts)
-            asked = [pixels[0] for N, (_, pixels) in zip(counts, scenes) for _ in range(N)]
-        maps = _join([  # rows, C, K, H, W
-            one_hot_maps(torch.from_numpy(pixels).to(self._device), self.image_size).expand(
-                N, -1, -1, -1, -1) for N, (_, pixels) in zip(counts, scenes)])
+        places = np.repeat([pixels for _, pixels in scenes], counts, 0)  # rows, C, K, 2
+        maps = one_hot_maps(torch.from_numpy(places).to(self._device), self.image_size)
         levels: list[list[list[Subgoal]]] = [[] for _ in requests]
         for level in range(1, max(request.recursion_depth for request in requests) + 1):
             # Those that go on are the first rows, since the deepest come first.
@@ -145,7 +143,7 @@ class SubgoalPredictor(Predictor):
             shown, known, copied = context, maps, sources[:rows]
             if bank is not None:
                 shown = bank.beside(context, alike[:rows], level)
-                known = bank.beside_maps(maps, asked[:rows], alike[:rows], level)
+                known = bank.beside_maps(maps, places[:rows, 0], alike[:rows], level)
                 copied = [[*pictures, bank.keyframes[n]] for pictures, n in zip(
                     copied, bank.numbers(alike, level))]
             prediction = self._network(shown, z)
