@@ -10,7 +10,7 @@ demonstration small pictures of start and goal, keyframes as PNGs, and where its
 them, where the recordings tell.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
