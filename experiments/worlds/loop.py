@@ -127,7 +127,7 @@ def draw(args):
 
 def make_weights(args, task, seed):
     """Make bags and trainings of a task; return Weights by method."""
-    bag, runs, count = Path(args.bags, task), Path(args.runs, task), SUBGOALS.get(task, 0)
+    bag, runs, ways = Path(args.bags, task), Path(args.runs, task), WAYS.get(task, ())
     world, _, name = task.rpartition('/')
     planned = [method for method in args.methods if method in PLANNED]
     if not planned:
@@ -138,12 +138,12 @@ def make_weights(args, task, seed):
             seed=first, image_size=IMAGE_SIZE, episodes_per_file=10), args.engine)
     forward = str(train([bag / pushes for pushes in BAGS], runs / 'forward', 'forward',
                         steps=args.steps, **FORWARD))
-    marks = str(mark(bag / 'goal', WAYS.get(task, ())))
+    marks = str(mark(bag / 'goal', ways))
     weights = {method: Weights(forward, '', f'{bag / "goal"}{os.pathsep}{marks}')
                for method in planned if seed == 0 or method in LEARNED}
     for method, settings in (
-            ('fixed time', {'loss': 'fix', 'min_crop': 0.3 if count > 1 else 1.0}),
-            ('subgoal', {'selection': 'marks', 'marks': marks, 'recursion': max(1, count)})):
+            ('fixed time', {'loss': 'fix', 'min_crop': 0.3 if ways else 1.0}),
+            ('subgoal', {'selection': 'marks', 'marks': marks, 'recursion': max(1, len(ways))})):
         if method in weights:
             weights[method] = weights[method]._replace(predictor=str(train(
                 bag / 'goal', runs / f'{method.replace(" ", "_")}_{seed}',
