@@ -100,8 +100,9 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
 
     p = sum over c of mask_c * warp(map_c, flow_c), divided by its sum. A map that loses nearly
     all its mass (the flow jumps over the object's pixel) is blurred by one pixel before warping;
-    if that does not help, it is the mask-weighted mixture of the maps where they were, and
-    if the masks hide these too, their plain mean.
+    if that does not help, the object is where a keyframe has it, which is after start and goal;
+    else it is the mask-weighted mixture of the maps where they were, and if the masks hide these
+    too, their plain mean.
 
     :param maps: (B, C, K, H, W), maps in each context picture, each summing to 1; those of start
         and goal. In a keyframe of another demonstration also 0: nothing is known of the object.
@@ -115,7 +116,8 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
     candidates = [combine(warp(maps, flow), masks)]  # B, K, H, W
     mass = candidates[0].sum((-2, -1))
     if bool((mass < MIN_MASS).any()):
-        candidates += [combine(warp(blur(maps), flow), masks), combine(maps, masks), maps.mean(1)]
+        candidates += [combine(warp(blur(maps), flow), masks), *maps[:, 2:].unbind(1),
+                       combine(maps, masks), maps.mean(1)]
     warped = candidates[-1]
     for candidate in reversed(candidates[:-1]):
         kept = candidate.sum((-2, -1), keepdim=True) >= MIN_MASS
