@@ -118,7 +118,7 @@ class Marking:
         crop = [] if '--crop' in options or height == width else ['--crop', 'centre']
         how = ['--recursion', str(count)] * (count > 1) + ['--keyframes', '--no-new-pixels']
         return [shlex.join(['python', '-m', 'tap_ros', *words]) for words in (
-            ['label', *both, *_only(options, '--image-topic'), '--out', f'labels/{name}'],
+            ['label', *both, *_without(options, '--crop'), '--out', f'labels/{name}'],
             ['train', 'predictor', *both, *options, *crop, '--size', '64', *how,
              '--test-fraction', '0.25', '--threads', '1', '--out', f'runs/{name}'])]
 
@@ -146,6 +146,6 @@ def spread(left: Iterable[int], marked: Collection[int]) -> list[int]:
     return found + rest
 
 
-def _only(options: Sequence[str], name: str) -> list[str]:
-    """Return the options of a name, of names and values."""
-    return [word for pair in zip(options[::2], options[1::2]) if pair[0] == name for word in pair]
+def _without(options: Sequence[str], name: str) -> list[str]:
+    """Return all options but those of a name, of names and values."""
+    return [word for pair in zip(options[::2], options[1::2]) if pair[0] != name for word in pair]

@@ -14,7 +14,8 @@ from tap_ros.images.robot_mask import hidden_pixels, RobotMask
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import Mark, Marks, read_marks
 from tap_ros.recording.reading import reading_of
-from tap_ros.training.labels import Film, film_of, fit, SIZE, spread
+from tap_ros.training.films import film_together, signals_like
+from tap_ros.training.labels import Film, fit, SIZE, spread
 from tap_ros.training.preference import describe, LEAST_FRAMES, still
 from tap_ros.training.run import bags_of
 
@@ -93,7 +94,12 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
             raise ConfigError(
                 f'marks: demonstration {i} has {len(marks.episodes[i])}, and each needs {count}, '
                 f'one for a level of recursion; mark as many, or give --recursion{one}')
-    films = [film_of(store, i, hidden_of(store, i, config.robot_mask)) for i in range(len(store))]
+    beside = [open_recordings(bags_of(config), progress=False, reading=replace(
+        reading_of(config), image_topic=topic, crop='whole', size=SIZE))
+        for topic in config.label_topic]
+    signals = signals_like(store, config.label_signals)
+    films = [film_together(store, i, beside, signals, hidden_of(store, i, config.robot_mask))
+             for i in range(len(store))]
     # All marks of a demonstration are found together, also where one is trained on.
     moments = {i: np.array([
         store[i].stamps[(first + last) // 2] - store[i].stamps[0]

@@ -5,13 +5,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import Folder
 from tap_ros.images.robot_mask import RobotMask
 from tap_ros.prediction.keyframe_bank import MOST_LEVELS
+from tap_ros.recording.reading import Topics
 from tap_ros.training.run_config import RunConfig
+from tyro import conf
 
 Mode = Literal['bidirectional', 'forward']  # contract.MODES
 Loss = Literal['fix', 'min', 'genmin']
@@ -46,6 +48,8 @@ class TrainingConfig(RunConfig):
     :param marks: JSON file of demonstrations whose bottleneck a person has marked, see `mark`.
         Start and goal are then drawn around the label.
     :param mark_name: train on the marks of this name alone, where a demonstration has several.
+    :param label_topic: cameras that tell the moment beside the predictor's own, as of the wrist.
+    :param label_signals: parts of names of signals that tell it, too, as in `label`.
     :param label_weight: of log w(t) beside the l1 error, with selection marks; w(t) is how likely
         a frame is the label. 0: any of the likeliest frames alike.
     :param keyframes: the network is also given the labelled frame of the demonstration that is
@@ -108,6 +112,9 @@ class TrainingConfig(RunConfig):
     selection: Selection = 'progress'
     marks: str = ''
     mark_name: str = ''
+    label_topic: Topics = ()
+    label_signals: Annotated[tuple[str, ...], conf.arg(
+        metavar='PART [PART ...]', help_behavior_hint='(default: none)')] = ()
     label_weight: float = 0.01
     keyframes: bool = False
     gan: bool = False
@@ -174,6 +181,9 @@ class TrainingConfig(RunConfig):
         if self.marks and (self.min_crop < 1 or self.start_crop):
             raise ConfigError('marks: start and goal are drawn around the label; leave min_crop '
                               'and start_crop out, which draw them anywhere')
+        if (self.label_topic or self.label_signals) and not self.marks:
+            raise ConfigError('label_topic, label_signals: they tell the moment of marks; give '
+                              '--marks')
         if self.keyframes and (not self.marks or self.forward or self.new_pixels
                                or self.recursion > MOST_LEVELS):
             raise ConfigError('keyframes: they are the frames that marks label, between a start '

@@ -19,7 +19,7 @@ from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.__main__ import main
-from tap_ros.apps.label_command import Options
+from tap_ros.apps.label_command import Options, WholeReading
 from tap_ros.apps.mark_command import MarkServer, parse_names, words_of
 from tap_ros.apps.marking import Marking
 from tap_ros.base.errors import ConfigError
@@ -224,12 +224,13 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
     for i in range(2):
         assert not marking.commands(words)
         marking.mark(i, [3, 6])
-    label, train = map(shlex.split, marking.commands(['--rate', '4']))
+    label, train = map(shlex.split, marking.commands(
+        ['--crop', 'centre', '--rate', '4', '--gap', '2.0']))
     assert label == ['python', '-m', 'tap_ros', 'label', str(bag), '--marks', 'my marks.json',
-                     '--out', 'labels/squares']
-    assert train[3:] == ['train', 'predictor', str(bag), '--marks', 'my marks.json', '--rate',
-                         '4', '--crop', 'centre', '--size', '64', '--recursion', '2',
-                         '--keyframes', '--no-new-pixels', '--test-fraction', '0.25',
+                     '--rate', '4', '--gap', '2.0', '--out', 'labels/squares']
+    assert train[3:] == ['train', 'predictor', str(bag), '--marks', 'my marks.json', '--crop',
+                         'centre', '--rate', '4', '--gap', '2.0', '--size', '64', '--recursion',
+                         '2', '--keyframes', '--no-new-pixels', '--test-fraction', '0.25',
                          '--threads', '1', '--out', 'runs/squares']
     one = Marking(store, [str(bag)], tmp_path / 'one.json', ['grasp'])
     for i in range(2):
@@ -240,6 +241,7 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
     assert f'\n{words}\n' in page, 'the page of the first hour has this command'
     asked = parse(Options, label[4:])
     assert asked.recordings == (str(bag),) and asked.marks == 'my marks.json'
+    assert asked.reading == replace(WholeReading(), rate=4, gap=2)
 
 
 def test_connections_to_the_page_are_few_and_end_in_time(page, monkeypatch):

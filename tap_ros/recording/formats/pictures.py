@@ -8,7 +8,7 @@ another meaning.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from tap_ros.base.errors import ConfigError, ImageError, RecordingError, RecordingWarning
 from tap_ros.base.files import only_writer
-from tap_ros.base.options import default_text, Folder
+from tap_ros.base.options import check_different, default_text, Folder
 from tap_ros.base.progress import Progress
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
@@ -96,8 +96,9 @@ class Options(Target):
     task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
 
     def __post_init__(self) -> None:
-        """Refuse rates that no camera has."""
+        """Refuse rates that no camera has, and a camera that is given twice."""
         super().__post_init__()
+        check_different('--camera', self.camera)
         if not 0 <= self.fps <= 1000:
             raise ConfigError(f'--fps {self.fps}: expected more than 0, to 1000, or 0')
 
@@ -266,6 +267,17 @@ def signal_fields(found: Mapping[str, np.ndarray]) -> dict[str, Any]:
     with np.errstate(over='ignore'):  # absurd numbers become infinite
         signals = np.concatenate([*found.values()], 1, dtype=float, casting='unsafe')
         return {'signal_names': tuple(names), 'signals': signals.astype(np.float32)}
+
+
+def print_signals(names: Collection[str], count: int = 0) -> None:
+    """
+    Print which numbers beside the pictures are kept as signals, if any.
+
+    :param names: of arrays of so many numbers in all; or of each number, see signal_fields.
+    """
+    if names:
+        arrays = names if count else dict.fromkeys(re.sub(r'/\d+$', '', name) for name in names)
+        print(f'signals: {listing(arrays)}: {count or len(names)} numbers')
 
 
 def _is_free(folder: Path) -> bool:
