@@ -42,6 +42,13 @@ def test_marked_is_where_the_object_comes_to_rest_by_the_way(tmp_path):
     assert [first for first, _ in marks] in ([a, b] for a in (2, 3) for b in (6, 7))
 
 
+def test_a_fixed_time_is_marked_half_way_and_at_a_quarter_in_every_demonstration(tmp_path):
+    bag = write_moves(tmp_path, [[4, 4]] * 9, ('success', 'failure'))
+    marks = read_marks(loop.mark_times(bag, 2), open_recordings([bag])).episodes
+    assert {i: list(map(tuple, those)) for i, those in marks.items()} == dict.fromkeys(
+        (0, 1), [(2, 2), (4, 4)])
+
+
 def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
         tmp_path, monkeypatch):
     ran = []
