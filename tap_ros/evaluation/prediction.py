@@ -198,10 +198,11 @@ def ask(network: PredictorNetwork | Predictor, batch: Batch,
     if size:
         z = draw_latents(episodes, 1, size)[:, 0].to(device)
     prediction = network(to_float(batch.context).to(device), z)
-    alike = [0] * len(batch.context) if network.bank is None else network.bank.find(
-        batch.context.cpu().numpy())[0].tolist()
+    if (bank := getattr(network, 'bank', None)) is None:
+        return prediction.image, lambda b, pixels: predicted_maps(pixels, prediction, b)
+    alike, _ = bank.find(batch.context.cpu().numpy())
     return prediction.image, lambda b, pixels: predicted_maps(
-        pixels, prediction, b, network.bank, alike[b])
+        pixels, prediction, b, bank, int(alike[b]))
 
 
 def draw_latents(episodes: Iterable[int], count: int, size: int) -> torch.Tensor:

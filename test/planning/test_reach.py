@@ -221,6 +221,19 @@ def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
     assert reach.targets == [first, second, GOAL] and reach.switches == [1, 2]
 
 
+@pytest.mark.parametrize('passed', [0.0, 3.0])
+def test_a_subgoal_may_be_passed_farther_off_than_the_goal_is_reached(mpc, passed):
+    reach = Reach(mpc, ReachConfig(10, reached=1.0, passed=passed), 3)
+    reach.step(look(0))
+    reach.set_targets([Target(START + 4), GOAL])
+    for pixels, stage in ((START, 0), (START + 2, int(passed > 0)), (START + 4, 1), (
+            GOAL.pixels + 2, 1)):
+        command = reach.step(look(reach.steps, pixels))
+        assert isinstance(command, Command) and command.stage == stage
+        reach.sent()
+    assert isinstance(reach.step(look(4, GOAL.pixels)), End)
+
+
 def test_a_later_round_knows_where_the_gripper_met_something(mpc, monkeypatch):
     plan, known = mpc.plan, []
 
