@@ -99,7 +99,7 @@ class Wait:
 
 @dataclass(frozen=True)
 class End:
-    """The goal has ended: 'reached', 'spent' (the step budget) or 'aborted'."""
+    """The goal has ended: 'reached', 'spent' (the step budget) or 'aborted'; and that in words."""
 
     outcome: str
     message: str
@@ -309,10 +309,9 @@ class Reach:
         self.pixels = pixels = seen.pixels
         self.distance = itinerary.targets[-1].distance(pixels)
         if self.distance <= config.reached:
-            return End('reached', f'{self.distance:.1f} px from the goal, reached')
+            return End('reached', 'reached')
         if self.steps >= self._budget:
-            return End('spent', f'{self.distance:.1f} px from the goal, '
-                                f'step budget of {self._budget} spent')
+            return End('spent', f'stopped, as the step budget of {self._budget} is spent')
         # what to go to
         before = len(state.switches) - len(state.earlier)
         stage = itinerary.stage(self.steps - state.first_step, pixels, before)

@@ -64,7 +64,7 @@ def test_one_command_a_picture_until_the_budget_is_spent(mpc):
         assert isinstance(reach.step(look(t)), Wait)  # the same picture again
     end = reach.step(look(3))
     assert isinstance(end, End) and end.outcome == 'spent' and reach.steps == 3
-    assert '4.0 px' in end.message and '3 spent' in end.message
+    assert reach.distance == pytest.approx(4) and 'budget of 3 is spent' in end.message
 
 
 def test_a_goal_that_is_reached_ends_at_once_and_the_default_budget_is_the_papers(mpc):

@@ -124,6 +124,8 @@ function showState() {
   allow('predict', busy || done.predict[2]);
   allow('direct', busy || done.go[2], 'to the goal at once');
   allow('subgoal-run', busy || done.go[2] || done.predict[2], 'first to a predicted subgoal');
+  $('subgoal-run').textContent = `go ${run.spent ? 'on ' : ''}via subgoal`;
+  $('direct').textContent = `go ${run.spent ? 'on ' : ''}direct`;
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
   $('propose').hidden = $('follow').hidden = !selecting();
