@@ -113,6 +113,8 @@ def test_training_learns_the_moment_from_another_camera(bag, shown, tmp_path):
     away = [abs(store.seconds(i)[found[i][0].argmax()] - shown[i][2][1])
             for i in range(MARKED, COUNT)]
     assert np.median(away) < 0.11
+    with pytest.raises(ConfigError, match='label_topic: /a/rgb is given twice'):
+        replace(config, label_topic=('/a/rgb',)).check()
     with pytest.raises(ConfigError, match='give --marks'):
         replace(config, marks='', selection='progress').check()
 
