@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.demonstrations import Demonstration
-from sim_bridge.pushes import demonstrate_pushes
+from sim_bridge.pushes import demonstrate_pushes, Route
 from sim_bridge.world.camera import OneCamera
 from sim_bridge.world.protocol import clip_action, Observation
 from tap_ros.base.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
@@ -92,6 +92,10 @@ class GymWorld(OneCamera, ABC):
         self.begin(self.seed)
         self._target = self.gripper()[:3]
         return self.observe()
+
+    def route(self) -> Route:
+        """Return which object goes where, one after the other: by the ways, then to the goal."""
+        return [*((0, np.array(way)) for way in self.ways), (0, self.goal_places()[0, :2])]
 
     def step(self, action: ArrayLike) -> Observation:
         """

@@ -7,7 +7,7 @@ From demonstrations, pushes to the goal, around what is in the way, that vary as
 predictor learns; from pushes at random, which hit, graze and miss, a forward model.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -34,26 +34,28 @@ MISS = (0.3, 0.02, 0.04)  # likewise, of pushes at random
 STRAY = 0.012  # m, deviation of the places by the way
 PAUSE_RANGE = (1, 30)  # actions, before which demonstrations pause
 WALK = 0.15  # m, to which a demonstration walks about before it begins
+Route = list[tuple[int, np.ndarray]]  # objects, and a place (x, y) of each, m
 
 
 def push_to_goal(world: Any, rng: np.random.Generator | None = None,
-                 ways: Sequence[Sequence[float]] | None = None) -> Iterator[np.ndarray]:
+                 route: Route | None = None) -> Iterator[np.ndarray]:
     """
-    Push the object of a GymWorld to its goal, knowing all in metres.
+    Push the objects of a GymWorld to their goals, knowing all in metres.
 
     :param world: after its reset.
-    :param ways: places (2,) m to push it by; None: those of the world.
+    :param route: which object goes where; None: that of the world.
     :param rng: of what varies; None: nothing does.
     :yield: actions (4,), each to be carried out before the next is asked for.
     """
     off, speeds = np.zeros(3), (PUSHED[1], TRAVEL[1])
-    places = np.array([*(world.ways if ways is None else ways), world.goal_places()[0, :2]])
+    objects, steps = zip(*(world.route() if route is None else route))
+    places = np.array(steps)
     if rng is not None:
         places[:-1] += rng.normal(0, STRAY, places[:-1].shape)
-    for place in places:
+    for k, place in zip(objects, places):
         for _ in range(MOST_PUSHES):
             seen = world.observe()
-            here = seen.object_poses[0, :2]
+            here = seen.object_poses[k, :2]
             if np.linalg.norm(place - here) < NEAR:
                 break
             if rng is not None:
@@ -68,7 +70,8 @@ def push_about(world: Any, rng: np.random.Generator) -> Iterator[np.ndarray]:
     for _ in range(MOST_PUSHES):
         seen, goal = world.observe(), rng.uniform(REACH_LOW, REACH_HIGH)
         off, speeds = rng.normal(0, MISS), (rng.uniform(*PUSHED), rng.uniform(*TRAVEL))
-        yield from _push(off, speeds, seen.gripper, seen.object_poses[0, :2], goal)
+        here = seen.object_poses[rng.integers(len(seen.object_poses)), :2]
+        yield from _push(off, speeds, seen.gripper, here, goal)
 
 
 def _push(off: np.ndarray, speeds: tuple[float, float], hand: np.ndarray, here: np.ndarray,

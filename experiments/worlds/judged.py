@@ -11,8 +11,8 @@ from experiments.planning.episode import run_episode
 from experiments.planning.methods import FIRST_SCENE, Method
 import numpy as np
 from PIL import Image
-from sim_bridge.metaworld import MetaWorld
 from sim_bridge.pushes import push_to_goal
+from sim_bridge.world.protocol import make_world
 from tap_ros.base.contract import ACTION_LIMIT, step_budget
 from tap_ros.base.errors import SceneError
 from tap_ros.images.crop import trained_crop
@@ -30,8 +30,9 @@ import torch
 IMAGE_SIZE = 64
 UNTRAINED = ('random', 'straight', 'around')  # methods that need nothing but the world
 PLANNED = ('direct', 'places', 'retrieval', 'fixed time', 'subgoal')
-WITH_WAYS = ('around', 'places')  # which something in the way makes different from others
-BUDGETS = {'push-wall-v3': 55}  # commands; else contract.step_budget
+WITH_WAYS = ('around', 'places')  # of tasks with subgoals that are put by hand
+SUBGOALS = {'push-wall-v3': 2, 'ogbench/cube-double': 1}  # so many
+BUDGETS = {'push-wall-v3': 55, 'ogbench/cube-double': 70}  # commands; else contract.step_budget
 # Half of what is usual, so that a plan takes half the time.
 PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threads=1)
 # px, here about cm: within this, the object is where it shall be. A hand that is pushing goes on
@@ -52,17 +53,24 @@ class Weights(NamedTuple):
     keyframes: str = ''  # recordings and their marks, as NearestKeyframe.load takes them
 
 
-class Judged(MetaWorld):
-    """Meta-World, and what it says after every step."""
+class Judged:
+    """A GymWorld, and what it says after every step; a name without a world is Meta-World's."""
+
+    def __init__(self, name, image_size):
+        world, _, task = name.rpartition('/')
+        self.world = make_world(world or 'metaworld', task, image_size)
+
+    def __getattr__(self, name):
+        return getattr(self.world, name)
 
     def reset(self, seed):
         """Begin a scene."""
         self.said, self.actions = [], []
-        return super().reset(seed)
+        return self.world.reset(seed)
 
     def step(self, action):
         """Act, and note."""
-        seen = super().step(action)
+        seen = self.world.step(action)
         self.said.append(self.succeeds())
         self.actions.append(np.asarray(action))
         return seen
@@ -70,16 +78,18 @@ class Judged(MetaWorld):
 
 class Places(Predictor):
     """
-    Subgoals that are put by hand: the object at the places by the way; the picture is the start.
+    Subgoals that are put by hand: the objects on their route; the picture is the start.
 
-    :param world: whose `ways` they are, after a reset.
+    :param world: whose `route` it is, after a reset.
     """
 
     mode = 'bidirectional'
 
     def __init__(self, world):
-        height = world.object_poses()[0, 2]
-        self.pixels = world.camera.project([(*way, height) for way in world.ways])[:, None]
+        places, self.pixels = world.object_poses()[:, :3], []
+        for k, place in world.route()[:-1]:
+            places[k, :2] = place
+            self.pixels.append(world.camera.project(places).astype(np.float32))
         self.image_size, self.training = (IMAGE_SIZE, IMAGE_SIZE), {}
         self.camera_crop = trained_crop(self.training, self.image_size)
 
@@ -87,8 +97,8 @@ class Places(Predictor):
         """Answer requests."""
         return [[Subgoal(
             request.start, one_hot_maps(torch.from_numpy(at), self.image_size).numpy(), at,
-            np.ones(1, np.float32), 0, len(self.pixels) - i)
-            for i, at in enumerate(self.pixels.astype(np.float32))] for request in requests]
+            np.ones(len(at), np.float32), 0, len(self.pixels) - i)
+            for i, at in enumerate(self.pixels)] for request in requests]
 
 
 _world, _planner = lru_cache(Judged), lru_cache(VisualMPC.load)
@@ -99,26 +109,27 @@ def run_scene(task, method, seed, weights, folder):
     """Run a method in a scene; return what came of it, None if the scene has no goal."""
     world = _world(task, IMAGE_SIZE)
     try:
-        start, shown, switches = _act(world, method, seed, weights)
+        start, shown, switches = _act(world, task, method, seed, weights)
     except SceneError:
         return None
     kept = Path(folder, f'{method}_{seed}.npz')
     if seed < FIRST_SCENE + STRIPS and not kept.exists():  # of the first training
         np.savez(kept, actions=world.actions, shown=shown)
-    goal = world.goal().object_poses[0, :3] - world.goal_places()[0]
+    goal = world.goal().object_poses[:, :3] - world.goal_places()
     return {'task': task, 'method': method, 'seed': seed, 'ends': bool(world.succeeds()),
             'ever': any(world.said), 'steps': len(world.said),
-            'goal_cm': _cm(np.linalg.norm(goal)), 'start_cm': _cm(start),
-            'final_cm': _cm(world.distances()[0]), 'switches': switches}
+            'goal_cm': _cm(np.linalg.norm(goal, axis=1)), 'start_cm': _cm(start),
+            'final_cm': _cm(world.distances()), 'switches': switches}
 
 
 def _cm(metres):
-    return round(100 * float(metres), 2)
+    """Return the mean over objects (K,) m."""
+    return round(100 * float(np.mean(metres)), 2)
 
 
-def _act(world, method, seed, weights):
-    """Act; return m at the start, pictures of start, subgoals and end, steps that went on."""
-    budget = BUDGETS.get(world.task_name, step_budget(1))
+def _act(world, task, method, seed, weights):
+    """Act; return (K,) m at the start, pictures of start, subgoals, end, steps that went on."""
+    budget = BUDGETS.get(task, step_budget(1))
     if method in PLANNED:
         def predictor():
             return {'places': lambda: Places(world), 'direct': lambda: None,
@@ -129,16 +140,18 @@ def _act(world, method, seed, weights):
             world.reset(seed)
         ran = run_episode(
             world, _planner(weights.forward, PLANNER),
-            Method(method.replace(' ', '_'), recursion=max(1, len(world.ways))), budget, seed,
-            predictor(), REACHED.get(world.task_name, USUAL))
+            Method(method.replace(' ', '_'), recursion=max(1, SUBGOALS.get(task, 0))), budget,
+            seed, predictor(), REACHED.get(task, USUAL))
         frames = ran.frames
-        return ran.distances[0, 0], [
+        return ran.distances[0], [
             frames[0], *(subgoal.image for subgoal in ran.subgoals), frames[-1]], ran.switches
     last = first = world.reset(seed)
-    distance, rng = world.distances()[0], np.random.default_rng(seed)
+    distance, rng = world.distances(), np.random.default_rng(seed)
     actions = (np.append(rng.uniform(-1, 1, 3) * ACTION_LIMIT, 0) for _ in range(budget))
     if method != 'random':
-        actions = push_to_goal(world, ways=world.ways if method == 'around' else ())
+        away = np.linalg.norm(first.object_poses[:, :2] - first.gripper[:2], axis=1)
+        straight = [(k, world.goal_places()[k, :2]) for k in away.argsort()]
+        actions = push_to_goal(world, route=world.route() if method == 'around' else straight)
     for _, action in zip(range(budget), actions):
         last = world.step(action)
     return distance, [first.image, last.image], []

@@ -3,8 +3,8 @@
 """
 The command `python -m experiments worlds-loop`: a closed loop that another world judges.
 
-Bags of pushes in Meta-World, a forward model and predictors from them, and the loop of the nodes,
-planning/reach.py, in fresh scenes. What counts is the environment's own signal.
+Bags of pushes in another world, a forward model and predictors from them, and the loop of the
+nodes, planning/reach.py, in fresh scenes. What counts is the environment's own signal.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import os
 from pathlib import Path
 
 import cv2
-from experiments.pages import render, share
+from experiments.pages import markdown, render, share
 from experiments.planning.methods import FIRST_SCENE
 from experiments.worlds.judged import (
     BUDGETS,
@@ -22,6 +22,7 @@ from experiments.worlds.judged import (
     IMAGE_SIZE,
     PLANNED,
     run_scene,
+    SUBGOALS,
     UNTRAINED,
     Weights,
     WITH_WAYS,
@@ -41,7 +42,6 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
 from tqdm import tqdm
 
-WORLD = 'metaworld'
 BAGS = {'random': 100_000, 'goal': 0}  # of pushes; the first seed
 METHODS = (*UNTRAINED, *PLANNED)
 FILMED = ('subgoal', 'places')  # the first that is there beside direct
@@ -64,8 +64,8 @@ class Options:
     """
     Options of the command.
 
-    :param tasks: of Meta-World, in which an object slides on the table in view of the camera, such
-        as push-v3 and plate-slide-v3, where nothing is in the way.
+    :param tasks: in which objects slide on a table in view of the camera: of Meta-World, such as
+        push-v3 and plate-slide-v3, where nothing is in the way, or world/task.
     :param episodes: of each bag: demonstrations, and pushes at random.
     :param steps: of the training of each task's forward model.
     :param predictor_steps: of the training of each task's predictors.
@@ -75,7 +75,7 @@ class Options:
         authors does not bring about.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
     :param runs: folder of the trainings and of the scenes that were run.
-    :param out: folder for worlds_loop.json, worlds_loop.md and worlds_loop.png.
+    :param out: folder for worlds_loop.json, .md and .png; of OGBench worlds_loop_ogbench.json.
     :param results_only: run no more scenes.
     """
 
@@ -106,34 +106,36 @@ def run(args):
             run_scenes(args, task, make_weights(args, task, seed), seed)
     write_results(Path(args.runs), Path(args.out), args)
     draw(args)
-    print(Path(args.out, 'worlds_loop.md'))
+    print(*(Path(args.out, f'{page}.md') for page in by_page(args.tasks)))
 
 
 def draw(args):
     """Draw the scenes that are kept; film the first where one of FILMED succeeds, direct fails."""
-    strips, films = [], []
-    for task in args.tasks:
-        folder, (_, done) = Path(args.runs, task), read_rows(args.runs, task)
-        strips += filter(None, (draw_strip(task, seed, folder) for seed in done))
-        films += [(task, seed, folder, ('direct', method)) for method in FILMED
-                  for seed, rows in done.items() if {'direct', method} <= rows.keys()
-                  and rows[method] and rows[method]['ends'] and not rows['direct']['ends']]
-    if strips:
-        cv2.imwrite(str(Path(args.out, 'worlds_loop.png')), grid(strips)[..., ::-1])
-    if shown := next(filter(None, (film(*one) for one in films)), None):
-        write_atomically(Path(args.out, 'worlds_loop.webp'), shown)
+    for page, tasks in by_page(args.tasks).items():
+        strips, films = [], []
+        for task in tasks:
+            folder, (_, done) = Path(args.runs, task), read_rows(args.runs, task)
+            strips += filter(None, (draw_strip(task, seed, folder) for seed in done))
+            films += [(task, seed, folder, ('direct', method)) for method in FILMED
+                      for seed, rows in done.items() if {'direct', method} <= rows.keys()
+                      and rows[method] and rows[method]['ends'] and not rows['direct']['ends']]
+        if strips:
+            cv2.imwrite(str(Path(args.out, f'{page}.png')), grid(strips)[..., ::-1])
+        if shown := next(filter(None, (film(*one) for one in films)), None):
+            write_atomically(Path(args.out, f'{page}.webp'), shown)
 
 
 def make_weights(args, task, seed):
     """Make bags and trainings of a task; return Weights by method."""
     bag, runs, ways = Path(args.bags, task), Path(args.runs, task), WAYS.get(task, ())
+    world, _, name = task.rpartition('/')
     planned = [method for method in args.methods if method in PLANNED]
     if not planned:
         return {}
     for pushes, first in BAGS.items():
         collect(bag / pushes, CollectConfig(
-            world=WORLD, task=task, pushes=pushes, episodes=args.episodes, seed=first,
-            image_size=IMAGE_SIZE, episodes_per_file=10), args.engine)
+            world=world or 'metaworld', task=name, pushes=pushes, episodes=args.episodes,
+            seed=first, image_size=IMAGE_SIZE, episodes_per_file=10), args.engine)
     forward = str(train([bag / pushes for pushes in BAGS], runs / 'forward', 'forward',
                         steps=args.steps, **FORWARD))
     marks = str(mark(bag / 'goal', ways))
@@ -153,21 +155,25 @@ def mark(folder, ways=()):
     """
     Mark a dozen demonstrations, off by at most a frame: where the object comes to rest by the way.
 
-    :param ways: places (2,) m; without any the mark is where the hand is at the object.
+    :param ways: places (2,) m. Without any, the marks of several objects are where each but the
+        last has come to rest at its goal, the mark of one is where the hand is at it.
     """
     store, rng, marks = open_recordings([folder]), np.random.default_rng(0), {}
     for i in range(len(store)):
         episode = store[i]
         if episode.outcome != 'success':
             continue
-        if ways:
-            at = [_arrival(episode.object_poses[:, 0, :2], way) for way in ways]
+        places, last = episode.object_poses[..., :2], len(ways) or len(episode.object_names) - 1
+        stations = [(0, way) for way in ways] or list(enumerate(episode.goal_poses[:, :2]))
+        if last:
+            at = [_arrival(places[:, k], station) for k, station in stations]
+            at = at if ways or None in at else sorted(at)[:last]
         else:
-            places = episode.object_pixels[:, 0]
-            at = [int((np.linalg.norm(places - places[0], axis=1) > MOVED).argmax()) - 1]
+            pixels = episode.object_pixels[:, 0]
+            at = [int((np.linalg.norm(pixels - pixels[0], axis=1) > MOVED).argmax()) - 1]
         if None not in at and at == sorted({*at}):
             marks[i] = [(t, t) for t in np.clip(
-                at + rng.integers(0 if ways else -1, 2, len(at)), 1, len(episode) - 2).tolist()]
+                at + rng.integers(0 if last else -1, 2, len(at)), 1, len(episode) - 2).tolist()]
         if len(marks) == MARKED:
             break
     path = Path(folder, 'marks.json')
@@ -190,7 +196,7 @@ def run_scenes(args, task, weights, training=0):
     """Run methods in the scenes that have a goal; what was run is not run again."""
     path, done = read_rows(args.runs, task)
     chosen = [method for method in args.methods if method in weights
-              and (task in WAYS or method not in WITH_WAYS)]
+              and (task in SUBGOALS or method not in WITH_WAYS)]
     seed, count = FIRST_SCENE, 0
     with tqdm(total=args.scenes, unit='scene', desc=f'{task}: {", ".join(chosen)}') as bar:
         while chosen and count < args.scenes:
@@ -214,17 +220,30 @@ def read_rows(runs, task):
     return path, {int(seed): rows for seed, rows in found.items()}
 
 
+def by_page(tasks):
+    """Return tasks by the name of their world's page."""
+    found = {}
+    for task in tasks:
+        world = task.rpartition('/')[0]
+        found.setdefault('worlds_loop' + f'_{world}' * bool(world), []).append(task)
+    return found
+
+
 def write_results(runs, out, args):
-    """Write all rows and the table, as far as scenes were run."""
-    rows = [row for task in args.tasks for rows in read_rows(runs, task)[1].values()
-            for row in rows.values() if row]
-    if not rows:
-        return
-    write_rows(out / 'worlds_loop.json', rows)
-    write_atomically(out / 'worlds_loop.md', render(
-        'worlds/templates/worlds_loop.md.j2', table=summarise(rows), marked=MARKED,
-        episodes=args.episodes, steps=args.steps, predictor_steps=args.predictor_steps,
-        budget=BUDGETS['push-wall-v3']))
+    """Write all rows and the table of each world, as far as scenes were run."""
+    for page, tasks in by_page(args.tasks).items():
+        rows = [row for task in tasks for rows in read_rows(runs, task)[1].values()
+                for row in rows.values() if row]
+        if not rows:
+            continue
+        write_rows(out / f'{page}.json', rows)
+        values = {'table': summarise(rows), 'marked': MARKED, 'episodes': args.episodes,
+                  'steps': args.steps, 'predictor_steps': args.predictor_steps,
+                  'budget': BUDGETS['push-wall-v3']}
+        template = f'worlds/templates/{page}.md.j2'
+        known = Path(__file__).parents[1].joinpath(template).exists()
+        write_atomically(out / f'{page}.md', render(template, **values) if known
+                         else markdown(values['table'], 2) + '\n')
 
 
 def summarise(rows):

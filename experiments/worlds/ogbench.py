@@ -4,7 +4,7 @@
 OGBench's scene, demonstrated by its authors' oracles: cube, drawer, window and button.
 
 Also one move of its cube-double and one press of its puzzle: their goals take several, and a
-bottleneck is of one. They can be recorded, not planned in.
+bottleneck is of one. They can be recorded, not planned in, as sim_bridge/ogbench.py can.
 """
 
 from importlib import import_module

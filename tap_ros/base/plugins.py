@@ -35,7 +35,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         'stack2': 'sim_bridge.tasks.stack:STACK2', 'stack3': 'sim_bridge.tasks.stack:STACK3'},
     'tap_ros.trackers': {'rigid': 'tap_ros.tracking.rigid_tracker:RigidTracker'},
     'tap_ros.worlds': {'metaworld': 'sim_bridge.metaworld:MetaWorld',
-                       'mujoco_table': 'sim_bridge.simulator:Simulator'},
+                       'mujoco_table': 'sim_bridge.simulator:Simulator',
+                       'ogbench': 'sim_bridge.ogbench:CubeDouble'},
 }
 
 _HAS = {  # an attribute of what entry points of a group name; of others that they can be called

@@ -11,7 +11,13 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.images.crop import trained_crop
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.protocol import check_request, Predictor, Request
-from tap_ros.prediction.retrieval import ends_of, nearest_others, unlike, usual_distance
+from tap_ros.prediction.retrieval import (
+    ends_of,
+    nearest_others,
+    places_then,
+    unlike,
+    usual_distance,
+)
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
@@ -140,11 +146,5 @@ def recorded_places(episode: Episode, t: int, start_pixels: np.ndarray) -> np.nd
     :param start_pixels: (K, 2), (u, v) in the start picture of the request.
     :return: float32 (K, 2).
     """
-    from scipy.optimize import linear_sum_assignment  # takes a moment to import
-    places = np.array(start_pixels, np.float32)
-    begun, then = episode.object_pixels[0], episode.object_pixels[t]
-    known = np.flatnonzero(np.isfinite(np.concatenate([begun, then], 1)).all(1))
-    away = np.linalg.norm(places[:, None] - begun[None, known], axis=-1)
-    for k, j in zip(*linear_sum_assignment(away)):
-        places[k] = then[known[j]]
-    return places
+    places = places_then(episode.object_pixels[0], episode.object_pixels[t], start_pixels)
+    return np.where(np.isfinite(places), places, np.asarray(start_pixels, np.float32))

@@ -110,6 +110,8 @@ def test_marks_are_written_at_once_and_what_is_refused_changes_nothing(page, bag
     for place, data, headers, code in (
             ('mark', b'{"episode": 1, "frames": [0]}', {}, 400), ('mark', b'x', {}, 400),
             ('mark', b'{"episode": 1, "frames": ""}', {}, 400), ('mark', b'[' * 60000, {}, 400),
+            ('mark', b'{"episode": 1, "frames": [true, 2]}', {}, 400),
+            ('mark', b'{"episode": true, "frames": [2]}', {}, 400),
             ('mark', b' ' * 70000, {}, 413), ('mark', b'', {'Content-Length': '-1'}, 413),
             (f'frame/{"9" * 5000}/0', None, {}, 404), ('frame/0', None, {}, 404),
             ('about/0/0', None, {}, 404), ('about/x', None, {}, 404), ('about', None, {}, 404),
@@ -180,8 +182,10 @@ def test_marks_with_names_are_complete_and_in_their_order(bag, store, tmp_path):
     marking.mark(2, [3, 6])
     assert read_marks(path, store).names == ('grasp', 'release')
     assert Marking(store, [str(bag)], path).names == ('grasp', 'release')
-    Marking(store, [str(bag)], path, ['a', 'b']).mark(3, [3, 6])
-    assert read_marks(path, store).names == ('a', 'b')
+    for names in (['release', 'grasp'], ['a', 'b'], ['grasp']):  # else marks change their meaning
+        with pytest.raises(ConfigError, match='names: .* are grasp, release; leave --names out'):
+            Marking(store, [str(bag)], path, names)
+    path.write_text(path.read_text().replace('"names": ["grasp", "release"], ', ''))
     with pytest.raises(ConfigError, match='names: grasp, but demonstration 2 has 2 marks'):
         Marking(store, [str(bag)], path, ['grasp'])
     assert parse_names('grasp, release') == ['grasp', 'release'] and parse_names('') == []
@@ -225,7 +229,8 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
                      '--out', 'labels/squares']
     assert train[3:] == ['train', 'predictor', str(bag), '--marks', 'my marks.json', '--rate',
                          '4', '--crop', 'centre', '--size', '64', '--recursion', '2',
-                         '--test-fraction', '0.25', '--threads', '1', '--out', 'runs/squares']
+                         '--keyframes', '--no-new-pixels', '--test-fraction', '0.25',
+                         '--threads', '1', '--out', 'runs/squares']
     one = Marking(store, [str(bag)], tmp_path / 'one.json', ['grasp'])
     for i in range(2):
         one.mark(i, [3])

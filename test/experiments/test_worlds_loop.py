@@ -15,15 +15,17 @@ from tap_ros.recording.marks import read_marks
 
 
 def write_moves(tmp_path, places, outcomes, metres=None):
+    """Write a bag of one object, at places in pixels and in metres."""
     made = []
     for i, outcome in enumerate(outcomes):
         episode = move_squares(places[:2], places[:2], seed=i, outcome=outcome)
-        pixels = np.stack([places, places], axis=1).astype(np.float32)
-        poses = episode.object_poses
+        poses = np.zeros((len(places), 1, 7))
         if metres is not None:
-            poses = np.zeros((len(places), 2, 7))
-            poses[..., :2] = np.array(metres)[:, None]
-        made.append(replace(episode, object_pixels=pixels, object_poses=poses))
+            poses[:, 0, :2] = metres
+        made.append(replace(
+            episode, object_names=episode.object_names[:1], object_poses=poses,
+            object_pixels=np.array(places, np.float32)[:, None],
+            goal_pixels=episode.goal_pixels[:1], goal_poses=episode.goal_poses[:1]))
     return write_bag(tmp_path / 'bag', made)
 
 
@@ -40,6 +42,20 @@ def test_marked_is_where_the_object_comes_to_rest_by_the_way(tmp_path):
     (marks,) = read_marks(loop.mark(bag, ((0.13, 0), (0.12, -0.21))),
                           open_recordings([bag])).episodes.values()
     assert [first for first, _ in marks] in ([a, b] for a in (2, 3) for b in (6, 7))
+
+
+def test_marked_is_where_the_first_object_rests_at_its_goal_and_the_other_has_not_come(tmp_path):
+    episode = move_squares([[4, 4]] * 2, [[4, 4]] * 2, outcome='success')
+    poses, goals = np.zeros((12, 2, 7)), np.zeros((2, 7))
+    goals[:, 0] = -0.2, 0.2
+    poses[:, 1, 0] = [0, 0, 0.1, 0.19, *[0.2] * 8]  # goes first
+    poses[:, 0, 0] = [*[0] * 7, -0.1, -0.19, *[-0.2] * 3]
+    bag = write_bag(tmp_path / 'bag', [replace(
+        episode, frames=np.repeat(episode.frames[:1], 12, 0), stamps=np.arange(12) * 10 ** 8,
+        actions=np.zeros((12, 4), np.float32), grippers=np.zeros((12, 4), np.float32),
+        object_pixels=np.zeros((12, 2, 2), np.float32), object_poses=poses, goal_poses=goals)])
+    (((first, last),),) = read_marks(loop.mark(bag), open_recordings([bag])).episodes.values()
+    assert first == last and first in (3, 4)
 
 
 def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
@@ -84,4 +100,17 @@ def test_places_that_are_put_by_hand_are_subgoals_there():
     np.testing.assert_allclose(
         first.expected_pixels, world.camera.project([[0.12, 0, 0.02]]), atol=0.01)
     assert second.expected_pixels[0, 1] > first.expected_pixels[0, 1] + 10, 'nearer to the camera'
+    world.close()
+
+
+def test_half_way_in_ogbench_the_first_cube_is_at_its_goal_and_the_other_at_its_start():
+    pytest.importorskip('ogbench')
+    world = judged.Judged('ogbench/cube-double', 64)
+    start = world.reset(loop.FIRST_SCENE)
+    subgoal, = judged.Places(world).predict(
+        start.image, world.goal().image, start.object_pixels, world.goal().object_pixels)
+    first, last = world.order
+    expected = start.object_pixels.copy()
+    expected[first] = world.goal().object_pixels[first]
+    np.testing.assert_allclose(subgoal.expected_pixels, expected, atol=0.1)
     world.close()

@@ -10,6 +10,7 @@ import pytest
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from sim_bridge.demonstrations import demonstrate, find_bottleneck
 from sim_bridge.gym_world import GymWorld
+from sim_bridge.pushes import push_to_goal
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.protocol import make_world
 from tap_ros.base.engines import Engine
@@ -235,3 +236,41 @@ def test_what_stands_in_the_way_is_passed_by():
             gaps = episode.object_poses[:, 0, :2] - way
             assert np.linalg.norm(gaps, axis=1).min() < 0.06
     world.close()
+
+
+@pytest.fixture(scope='module')
+def ogbench():
+    pytest.importorskip('ogbench')
+    world = make_world('ogbench', 'cube-double', 64)
+    yield world
+    world.close()
+
+
+def test_ogbench_moves_as_it_is_told_and_repeats_from_its_seed(ogbench):
+    first = ogbench.reset(5)
+    seen = [ogbench.step([0.05, -0.02, -0.01, 0]) for _ in range(3)][-1]
+    np.testing.assert_allclose(
+        seen.gripper[:3] - first.gripper[:3], [0.15, -0.06, -0.03], atol=0.01)
+    again, goal = ogbench.reset(5), ogbench.goal()
+    np.testing.assert_array_equal(again.image, first.image)
+    np.testing.assert_array_equal(again.object_poses, first.object_poses)
+    assert set(np.unique(again.robot_mask)) <= {0, 128, 255} and (again.robot_mask == 128).any()
+    np.testing.assert_allclose(goal.object_poses[:, :3], ogbench.goal_places(), atol=1e-6)
+    for seen in (again, goal):
+        u, v = np.rint(seen.object_pixels).astype(int).T
+        assert (seen.image[v, u].max(1) > 150).all(), 'cubes are seen where they are'
+    first, last = ogbench.order
+    gap = goal.object_poses[last, :2] - again.object_poses[first, :2]
+    assert np.linalg.norm(gap) < 0.03, 'one cube stands where the other shall be'
+    with pytest.raises(SceneError, match='valid: cube-double'):
+        make_world('ogbench', 'cube-triple', 64)
+
+
+def test_in_ogbench_the_order_decides(ogbench):
+    ends = []
+    for turn in (1, -1):
+        ogbench.reset(0)
+        for action in push_to_goal(ogbench, route=ogbench.route()[::turn]):
+            ogbench.step(action)
+        ends.append(ogbench.outcome())
+    assert ends == ['success', 'failure']

@@ -232,7 +232,7 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
     :param frames: T pictures, uint8 (H, W, 3).
     :param seconds: (T,), when they were taken, increasing.
     :param object_names: of K objects, whose pixels are known.
-    :param known: other fields of Episode; what is left out is unknown, actions are zeros.
+    :param known: other fields of Episode; what is left out is unknown, and not recorded.
     :return: Episode.
     :raises ValueError: for times and a seed that a recording cannot hold.
     """
@@ -245,8 +245,10 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
         raise ValueError(f'its seed {escaped(known["seed"], 30)} is none: 0 to 2^64 - 1')
     known['task'] = known.get('task', '').encode(errors='replace').decode()[:MOST_CHARACTERS]
     unknown = np.full((T, K, 7), np.nan)
+    none = np.full((T, 4), np.nan, np.float32)
+    none[-1] = 0  # nothing leads on from the last frame
     fields = {
-        'actions': np.zeros((T, 4), np.float32), 'grippers': np.full((T, 4), np.nan, np.float32),
+        'actions': none, 'grippers': np.full((T, 4), np.nan, np.float32),
         'object_pixels': np.full((T, K, 2), np.nan, np.float32), 'object_poses': unknown,
         'goal_frame': None, 'goal_pixels': np.full((K, 2), np.nan, np.float32),
         'goal_poses': np.full((K, 7), np.nan), 'object_source': 'imported'}
