@@ -5,6 +5,7 @@
 // The connection, and the steps that lead from a scene to an arm that moves.
 
 const RECONNECT_MS = 1000;
+const LONG = 70;  // letters of an event that need a wide place
 const STEPS = ['scene', 'objects', 'goal', 'predict', 'go'];
 const VIEW = {scene: 'camera', objects: 'camera', goal: 'goal', predict: 'goal', go: 'subgoal'};  // which a step begins with
 
@@ -188,7 +189,7 @@ function hint() {
 
 function showEvents() {
   if (!events.length) return;
-  fill($('log'), [...events].reverse(), ({text, time, picture, problem}) => made('li', {className: picture ? '' : 'wide', title: text},
+  fill($('log'), [...events].reverse(), ({text, time, picture, problem}) => made('li', {className: picture && text.length < LONG ? '' : 'wide', title: text},
     ...picture ? [made('img', {src: picture, alt: ''})] : [],
     made('time', {textContent: new Date(1000 * time).toLocaleTimeString()}),
     made('div', {className: problem ? 'bad' : '', textContent: text})));
