@@ -215,9 +215,11 @@ class Tables:
                 '')
 
     def speed(self):
-        """List what `make bench` measured."""
+        """List what `make bench` measured and has an aim; what limits it where that is missed."""
         for row in measured_speed()['rows']:
-            yield Row(**row).cells
+            if row['aim']:
+                *cells, limit = Row(**row).cells
+                yield *cells, '' if row['reached'] else limit
 
 
 def measured_speed():
