@@ -2,16 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where an arm stands: by parameters, by tf_static, and what is said where these disagree."""
 
+from contextlib import suppress
 import math
 from types import SimpleNamespace
 
+import numpy as np
 from processes import LocalNode
 import pytest
 from rclpy.node import Node
 from tap_ros.base.errors import KinematicsError
+from tap_ros.nodes.robot_mask.node import RobotMaskNode
+from tap_ros.robots.ur10e import UR10E
 from tap_ros.ros.arm_place import ArmPlace
 from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.topics import encode_camera_info, encode_joints, to_stamp
 from test_frames import told
+from test_robot_mask_node import CAMERA
 
 TABLE = (0.0, 0.7, -0.1)  # of the simulated arm, turned to the right
 
@@ -84,3 +90,25 @@ def test_what_disagrees_is_refused_and_logged_once(standing, capfd, at, turn, wo
         with pytest.raises(KinematicsError, match=words):
             node.place.mount()
     assert capfd.readouterr().err.count('by tf_static base is in world at') == 1
+
+
+def test_the_mask_of_a_named_arm_is_where_tf_static_says_that_it_stands():
+    local = LocalNode(RobotMaskNode, '/elsewhere', urdf='ur10e', **CAMERA)
+    try:
+        node, middles = local.node, []
+        camera = encode_camera_info(np.array([[64., 0, 32], [0, 64, 32], [0, 0, 1]]), (64, 64),
+                                    to_stamp(10**9), 'eye')
+        angles = UR10E.joints_at([0.0, 0.0, 0.1])
+        for x in (0.0, 0.2):
+            node._frames._take(SimpleNamespace(transforms=[told(
+                'world', 'base', (x, *TABLE[1:]), turned(-math.pi / 2))]))
+            with suppress(KinematicsError):  # joints are told again to the arm that is elsewhere
+                node._mask(camera)
+            for second in (0.9, 1.1):
+                node._history.add(encode_joints(
+                    np.zeros(4), to_stamp(round(second * 1e9)), 'world',
+                    dict(zip(UR10E.joints, angles))), 0.0)
+            middles.append(np.argwhere(node._mask(camera))[:, 1].mean())
+        assert middles[1] > middles[0] + 3, 'to the right'
+    finally:
+        local.end()
