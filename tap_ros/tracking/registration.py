@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from tap_ros.base.contract import LOST, SEEN
-from tap_ros.tracking.picture import Palette, Picture
+from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane
 from tap_ros.tracking.protocols import Tracked, View
-from tap_ros.tracking.silhouette import centre, silhouette
+from tap_ros.tracking.silhouette import centre, Cut, silhouette
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 LEAST_FAR = 0.3  # share of an object that has to be seen
@@ -22,7 +22,7 @@ LEAST_SURE = 0.9  # confidence, else not found
 CHANGED = 8.0  # distance of colours
 LEAST_CHANGED = 60  # px of the working picture
 KEPT = 0.1  # weight of places where nothing changed
-MOST_TRIED = 32  # changes, the largest ones, where an object may have been
+MOST_TRIED = 16  # changes, the largest ones, where an object may have been
 PLACES = 6  # that are tried
 TRIED = 4  # turns at each of them that are tried finely
 APART = 0.035  # m from other objects
@@ -40,7 +40,7 @@ def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (
     :param region: (h, w) weights of places, or None.
     :param extra: places that are tried, too.
     """
-    plane = matcher.plane
+    plane = matcher.picture.plane
     side = max(5.0, template.area ** 0.5)
     dense = cv2.GaussianBlur(matcher.likeness(template), (0, 0), side / 2.5)
     if region is not None:
@@ -79,20 +79,14 @@ def mean_shift(matcher: Matcher, template: Template,
     like = matcher.likeness(template)
     h, w = like.shape
     half = min(max(6, round(template.area ** 0.5 * 0.6)), h // 2, w // 2)
-    u, v = matcher.plane.top_pixels(place) - half
+    u, v = matcher.picture.plane.top_pixels(place) - half
     box = (int(np.clip(u, 0, w - 2 * half)), int(np.clip(v, 0, h - 2 * half)), 2 * half, 2 * half)
     _, (u, v, width, height) = cv2.meanShift((255 * like).astype(np.uint8), box, _STOP)
     amount = float(like[v:v + height, u:u + width].sum()) / template.area
-    return matcher.plane.of_top((u + half, v + half)), amount
+    return matcher.picture.plane.of_top((u + half, v + half)), amount
 
 
-def change(first: Picture, second: Picture) -> np.ndarray:
-    """Return which pixels differ between two pictures, the robot aside, (h, w) bool."""
-    return (first.apart(second) > CHANGED) & ~first.hidden & ~second.hidden
-
-
-def register(first: Picture, picture: Picture, plane: Plane,
-             objects: Sequence[Template]) -> Tracked:
+def register(first: Picture, picture: Picture, objects: Sequence[Template]) -> Tracked:
     """
     Find objects by a template of each, the one that fits best first.
 
@@ -101,7 +95,7 @@ def register(first: Picture, picture: Picture, plane: Plane,
     """
     changed = (first.apart(picture) > CHANGED).astype(np.float32)
     region = KEPT + cv2.GaussianBlur(changed, (0, 0), 4)
-    matchers = {one.metric: Matcher(picture.by(one.metric), plane) for one in objects}
+    matchers = {one.metric: Matcher(picture.by(one.metric)) for one in objects}
     found: dict[int, Pose] = {}
     for _ in objects:
         avoid = [pose.place for pose in found.values()]
@@ -111,7 +105,8 @@ def register(first: Picture, picture: Picture, plane: Plane,
             break
         best = min(tried, key=lambda k: tried[k].cost)
         found[best] = tried[best]
-    pixels, confidence = np.full((len(objects), 2), np.nan), np.zeros(len(objects))
+    plane, confidence = picture.plane, np.zeros(len(objects))
+    pixels = np.full((len(objects), 2), np.nan)
     states, outlines = [LOST] * len(objects), [np.zeros((0, 2))] * len(objects)
     for k, pose in found.items():
         confidence[k] = pose.confidence
@@ -119,7 +114,7 @@ def register(first: Picture, picture: Picture, plane: Plane,
             states[k] = SEEN
             pixels[k] = plane.enlarge(plane.middle_pixels(pose.place))
             outlines[k] = plane.enlarge(plane.top_pixels(
-                pose.template.outlined(pose.place, pose.angle)))
+                pose.template.placed(pose.template.outline, pose.place, pose.angle)))
     return Tracked(pixels, tuple(states), confidence, tuple(outlines))
 
 
@@ -132,25 +127,15 @@ def propose(start: View, goal: View) -> np.ndarray:
     """
     plane = Plane(None, start.image.shape[:2])
     before, after = Picture(start, plane), Picture(goal, plane)
-    changed = cv2.morphologyEx(change(before, after).astype(np.uint8), cv2.MORPH_OPEN,
-                               np.ones((3, 3), np.uint8))
-    count, labels, stats, centres = cv2.connectedComponentsWithStats(changed)
-    found: list[tuple[int, np.ndarray]] = []
-    for i in np.argsort(-stats[1:, cv2.CC_STAT_AREA])[:MOST_TRIED] + 1:
-        if stats[i, cv2.CC_STAT_AREA] < LEAST_CHANGED:
+    changed = (before.apart(after) > CHANGED) & ~before.hidden & ~after.hidden
+    _, _, stats, centres = cv2.connectedComponentsWithStats(cv2.morphologyEx(
+        changed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
+    areas, cuts = stats[1:, cv2.CC_STAT_AREA], list[Cut]()
+    for i in np.argsort(-areas)[:MOST_TRIED]:
+        if areas[i] < LEAST_CHANGED:
             break
-        part = labels == i
-        beside = cv2.dilate(part.astype(np.uint8), np.ones((15, 15), np.uint8)) > changed
-        around = beside & ~before.hidden & ~after.hidden
-        if not around.any():
-            continue
-        table = Palette(before.lab[around])
-        here, there = (float(np.median(table.distance(picture.index[part])))
-                       for picture in (before, after))
-        if here <= there:  # something came there
-            continue
-        mask = silhouette(before, centres[i]).mask
-        if mask.any() and not any(np.hypot(*(centre(mask) - other)) < 8 for _, other in found):
-            found.append((int(mask.sum()), centre(mask)))
-    found.sort(key=lambda one: -one[0])
-    return plane.enlarge(np.reshape([at for _, at in found], (-1, 2)))
+        cut, later = (silhouette(picture, centres[i + 1]) for picture in (before, after))
+        if cut.contrast > later.contrast and all(cut.off(centre(one.mask)) > 8 for one in cuts):
+            cuts.append(cut)  # else something came there
+    cuts.sort(key=lambda cut: -cut.mask.sum())
+    return plane.enlarge(np.reshape([centre(cut.mask) for cut in cuts], (-1, 2)))
