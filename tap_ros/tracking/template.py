@@ -15,6 +15,7 @@ HIDDEN = 0.4  # cost of a point behind the robot: hiding there is no way out
 AROUND = 0.35  # weight of points beside the object that look like it
 SAME = 17.6  # distance below which a point has its own colour
 SURE, SHOWN = 0.9, 0.3  # of a pose, from which on it is sure
+MERGED = 0.4  # more of the points around have its colours than did: it is not told from those
 LEAST_SEEN = 0.2  # share of an object without which no pose near by is believed
 LEAST_SAME = 0.3  # share of points with their own colour without which nothing fits
 CONTRAST = 8.0  # of object and table, below which the surrounding says nothing
@@ -57,6 +58,7 @@ class Template:
         beside = _draw(outer > inner, RING, rng)
         near = self.palette.distance(picture.index[beside[:, 1], beside[:, 0]])
         self.contrast = float(np.median(near)) if len(near) else 0.0
+        self.beside = float((near < NEAR).mean()) if len(near) else 0.0
         self.normals: np.ndarray | None = None
         if plane.calibrated and face is not None:  # sides of the object are beside it
             smooth = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 3)
@@ -82,6 +84,7 @@ class Pose:
     cost: float  # 0 to 1.35
     seen: float  # share of the points that the robot does not hide
     fit: float  # share of those that have colours of the object
+    alone: bool  # what is around does not look like the object, too
     template: Template
 
     @property
@@ -93,7 +96,7 @@ class Pose:
     @property
     def sure(self) -> bool:
         """Whether what is there looks like what was clicked."""
-        return self.confidence > SURE and self.seen > SHOWN
+        return self.confidence > SURE and self.seen > SHOWN and self.alone
 
 
 class Matcher:
@@ -142,16 +145,20 @@ class Matcher:
             cost += AROUND * _mean(like) / np.maximum(_mean(free), 1e-3)
         return cost, seen
 
-    def fit(self, template: Template, place: np.ndarray, angle: float) -> float:
-        """Return the share of the points seen that have colours of the object."""
-        index = self._look(template.points, place[None], np.array([angle]))
+    def fit(self, template: Template, place: np.ndarray, angle: float) -> tuple[float, bool]:
+        """Return fit and alone of a Pose."""
+        turned = np.array([angle])
+        index = self._look(template.points, place[None], turned)
         apart, free = self._apart(template, index)
         same, known = (apart < SAME) & free, max(int(free.sum()), 1)
         if same.sum() <= LEAST_SAME * known:
-            return 0.0
+            return 0.0, False
         # other sides show as it turns: any of its colours fits
         own = self._like(template, index)[0] > 1 - NEAR / FAR
-        return float((same | own).sum() / known)
+        beside = self._like(template, self._look(template.ring, place[None], turned))[0]
+        alone = template.normals is not None or not beside.size or (
+            (beside > 1 - NEAR / FAR).mean() <= template.beside + MERGED)
+        return float((same | own).sum() / known), bool(alone)
 
     def _apart(self, template: Template, index: np.ndarray,
                thin: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +210,7 @@ class Matcher:
             best, turned = places[j], float(angles[i])
             reach, turn = reach * next_reach, turn * next_turn
         return Pose(best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
-                    self.fit(template, best, turned), template)
+                    *self.fit(template, best, turned), template)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
