@@ -23,6 +23,7 @@ from tap_ros.base.engines import Engine
 from tap_ros.base.files import write_atomically, write_rows
 from tap_ros.base.options import Folder
 from tap_ros.images.drawing import png_bytes
+from tap_ros.tracking import protocols
 
 SEED = 88_000
 TASKS = ('push2', 'push3', 'order2')
@@ -36,26 +37,19 @@ COLUMNS = {'UR10e, exact': ('arm', 0, 0.0), 'UR10e, clicks off': ('arm', 0, OFF)
 HARD = {'lifted (pick_place)': ('pick_place', None), 'stacked (stack2)': ('stack2', None),
         'light to 60%': ('push2', (0.6, 0.6, 0.6)), 'tint': ('push2', (1.1, 1.0, 0.8))}
 HARD_EPISODES = 8
-HARD_LINES = ('median_px', 'within_2px', 'wrong_sure', 'longest_wrong_sure', 'lost', 'goal_right',
-              'goal_wrong')
 COVERED_TASKS = 'push2', 'order2'
 PALE_SCENES = 30
 CLICK_LINES = {
-    'refused': 'clicks refused', 'selected_px': 'click to the middle of the object, px',
-    'selected_within_2px': 'within 2 px at once', 'later_within_2px': 'within 2 px at last',
-    'wrong_sure': 'wrong by 3 px at last, and said to be seen',
-    'confidence_at_once': 'confidence at once'}
+    'refused': 'refused', 'selected_px': 'off at once, px', 'selected_within_2px': 'within 2 px',
+    'later_within_2px': 'within 2 px at last', 'wrong_sure': 'wrong at last, seen'}
 LINES = {
-    'median_px': 'median error, px', 'within_2px': 'right: within 2 px',
-    'wrong_sure': 'wrong by 3 px and said to be seen',
-    'longest_wrong_sure': 'the same, most pictures in a row', 'lost': 'objects lost at the end',
-    'recovered': 'right within three pictures after an occlusion',
-    'selected_px': 'click to the middle of the object, px', 'refused': 'clicks refused',
-    'cpu_ms': 'CPU a picture of two objects, ms', 'goal_right': 'found in goal pictures, right',
-    'goal_visible_right': 'found where its middle is in sight', 'goal_wrong': 'found, and wrong',
-    'goal_refused': 'said to be not found'}
+    'median_px': 'median error, px', 'within_2px': 'within 2 px',
+    'wrong_sure': 'wrong, said to be seen', 'longest_wrong_sure': 'most pictures in a row',
+    'lost': 'lost at the end', 'goal_right': 'found in the goal',
+    'goal_wrong': 'found there, wrong'}
 LABELS = 'tracking_labels.json'
 METHODS = ('shipped', 'shipped:tracked')  # of pushing
+PUSHED = {'push2': 100, 'order2': 60}  # scenes that were asked for, by task
 REACHED_CM = 5.0
 
 
@@ -121,17 +115,23 @@ def page(rows, pushed):
     rows = pd.DataFrame(rows)
     rows['light'] = rows.get('light', pd.Series(index=rows.index, dtype=object)).fillna('')
     films = rows[rows.recording.str.endswith('.mp4')]
-    return render('templates/tracking.md.j2', columns=table(rows), films=film_table(films),
-                  hard=hard(rows), clicks=clicks(rows), hard_episodes=HARD_EPISODES,
+    return render('templates/tracking.md.j2', conditions=conditions(rows), clicks=clicks(rows),
+                  films=film_table(films), hard_episodes=HARD_EPISODES,
                   places=f'{int(films[films.metric == "within_2px"].n.sum()):,}',
-                  confidence=confidence(rows.drop(films.index)), real=len(films) > 0,
-                  loop=pushed, seed=SEED, off=OFF, episodes=EPISODES,
-                  longest=round(rows[(rows.metric == 'longest_wrong_sure')
-                                     & (rows.click_px == OFF)].value.max()))
+                  cpu=pooled(rows[~rows.recording.isin(films.recording)], 'cpu_ms'),
+                  film_cpu=f'{films[films.metric == "cpu_ms"].value.max():.0f}',
+                  lines=f'{code_lines():,}', real=len(films) > 0, loop=pushed, seed=SEED, off=OFF,
+                  episodes=EPISODES)
+
+
+def code_lines():
+    """Return how many lines the tracker's code has."""
+    return sum(len(file.read_text().splitlines()) for file in Path(
+        protocols.__file__).parent.glob('*.py'))
 
 
 def pooled(rows, metric):
-    """Return the mean of recordings, weighed by their numbers, with the widest of their ends."""
+    """Return the mean of recordings and of their intervals, weighed by their numbers."""
     rows = rows[rows.metric == metric]
     if not len(rows):
         return '-'
@@ -140,30 +140,23 @@ def pooled(rows, metric):
     if metric == 'longest_wrong_sure':
         return f'{rows.value.max():.0f}'
     if metric in ('median_px', 'selected_px', 'cpu_ms', 'confidence_at_once'):
-        return f'{value:.2f} ({low:.2f} to {high:.2f})'
+        return f'{value:.2f}'
+    if metric in ('wrong_sure', 'lost', 'goal_wrong'):
+        return f'{100 * value:.1f}%'
     return share((value, low, high))
 
 
-def of(rows, column):
-    """Return the rows of a column."""
-    look, size, click = COLUMNS[column]
-    return rows[rows.recording.isin([f'{task}_{look}_{SIZE}' for task in TASKS])
-                & (rows['size'] == size) & (rows.click_px == click) & (rows.light == '')]
-
-
-def table(rows):
-    """Return a table of metrics by column; times are of two objects."""
-    two = rows[(rows.metric != 'cpu_ms') | ~rows.recording.str.startswith('push3')]
-    return pd.DataFrame([{'': line} | {name: pooled(of(two, name), metric) for name in COLUMNS}
-                         for metric, line in LINES.items()])
-
-
-def hard(rows):
-    """Return a table of metrics by column of HARD."""
-    columns = {name: rows[(rows.recording == f'{task}_arm_{SIZE}') & (rows.light == _said(light))
-                          & (rows.click_px == OFF)] for name, (task, light) in HARD.items()}
-    return pd.DataFrame([{'': LINES[metric]} | {
-        name: pooled(mine, metric) for name, mine in columns.items()} for metric in HARD_LINES])
+def conditions(rows):
+    """Return a table of metrics, a line for each of COLUMNS and HARD."""
+    asked = {name: (TASKS, *column, None) for name, column in COLUMNS.items()}
+    asked |= {name: ((task,), 'arm', 0, OFF, light) for name, (task, light) in HARD.items()}
+    lines = []
+    for name, (tasks, look, size, click, light) in asked.items():
+        mine = rows[rows.recording.isin([f'{task}_{look}_{SIZE}' for task in tasks])
+                    & (rows['size'] == size) & (rows.click_px == click)
+                    & (rows.light == _said(light))]
+        lines.append({'': name} | {line: pooled(mine, metric) for metric, line in LINES.items()})
+    return pd.DataFrame(lines)
 
 
 def clicks(rows):
@@ -176,55 +169,38 @@ def clicks(rows):
     return pd.DataFrame([*lines, {'': 'clicks'} | count])
 
 
-def confidence(rows):
-    """Return a table of what is right by confidence."""
-    rows = rows[rows.metric == 'confidence']
-    lines = []
-    for low, mine in rows.groupby('step'):
-        right = (mine.value * mine.n).sum() / mine.n.sum()
-        lines.append({'confidence from': f'{low:g}', 'right': f'{100 * right:.1f}%',
-                      'pictures': f'{mine.n.sum():,}'})
-    return pd.DataFrame(lines)
-
-
 def loop(folder):
     """Compare pushing with tracked and with true objects; return what the page says of it."""
-    scenes = [{scene['seed']: scene for scene in json.loads(
-        Path(folder, 'planning', f'push2-{name.replace(":", "--")}.json').read_text())['scenes']}
-        for name in METHODS]
-    true, tracked = ([max(mine[seed]['objects_cm']) <= REACHED_CM for seed in scenes[0]]
-                     for mine in scenes)
-    placed = ['placed' in scenes[1][seed] for seed in scenes[0]]
+    def said(task, metric, method=METHODS[1], **about):
+        return find(folder, 'planning.json', task=task, method=method, metric=metric, **about)
 
-    def said(metric, method, **about):
-        row = find(folder, 'planning.json', task='push2', method=method, metric=metric, **about)
-        if metric.startswith('final'):
-            return number(row, 1, 1, ' cm', '+' if about else '')
-        return number(row, 100, 0, ' points' if about else '%', '+' if about else '')
-
-    lines = [{'': title, 'true pixels': said(metric, METHODS[0]),
-              'tracked': said(metric, METHODS[1]), 'difference': said(
-                  f'{difference}_difference{unit}', METHODS[1], compares='tracking')}
-             for title, metric, difference, unit in (
-                 ('success: all within 5 cm', 'success_5cm', 'success_5cm', ''),
-                 ('final distance', 'final_distance_cm', 'final_distance', '_cm'))]
-    beside = [pair for pair, clicked in zip(zip(true, tracked), placed) if not clicked]
+    lines, tracked = [], {}
+    for task in PUSHED:
+        gap = said(task, 'success_5cm_difference', compares='tracking')
+        true, mine = (number(said(task, 'success_5cm', method), 100) for method in METHODS)
+        lines.append({'': task, 'true pixels': true, 'tracked': mine, 'scenes': gap.n,
+                      'difference': number(gap, 100, 0, ' points', '+')})
+        tracked[task] = json.loads(Path(
+            folder, 'planning', f'{task}-{METHODS[1].replace(":", "--")}.json').read_text())[
+                'scenes']
+    scenes = [scene for those in tracked.values() for scene in those]
+    placed = [scene for scene in scenes if 'placed' in scene]
     return {
-        'table': pd.DataFrame(lines), 'scenes': len(true), 'points': lines[0]['difference'],
-        'placed': sum(placed), 'placed_failed': sum(
-            clicked and not ok for clicked, ok in zip(placed, tracked)),
-        'blocked': sum(scene['blocked'] > 0 for mine in scenes for scene in mine.values()),
-        'repeated': sum(scene['blocked'] > 2 for mine in scenes for scene in mine.values()),
-        'only_tracked': beside.count((True, False)), 'only_true': beside.count((False, True)),
-        'command': 'python -m experiments planning --tasks push2 --methods '
-                   f'{" ".join(METHODS)} --scenes {len(true)} --no-films '
-                   '--out docs/results/tracking'}
+        'table': pd.DataFrame(lines), 'scenes': len(scenes), 'placed': len(placed),
+        'placed_failed': sum(max(scene['objects_cm']) > REACHED_CM for scene in placed),
+        'refused': sum('refused' in scene for scene in scenes),
+        'points': ' and '.join(f'{line["difference"]} in {task}' for task, line in zip(
+            PUSHED, lines)),
+        'asked': ' and '.join(f'{count} of {task}' for task, count in PUSHED.items()),
+        'command': f'python -m experiments planning --tasks {" ".join(PUSHED)} --methods '
+                   f'{" ".join(METHODS)} --scenes {len(min(tracked.values(), key=len))} '
+                   '--no-films --out docs/results/tracking'}
 
 
 def film_table(rows):
     """Return a table of films."""
-    some = ('median_px', 'within_2px', 'wrong_sure', 'longest_wrong_sure', 'visible_lost',
-            'cpu_ms')
-    return pd.DataFrame([{'film': film} | {metric.replace('_', ' '): round(float(
-        mine[mine.metric == metric].value.iloc[0]), 2) for metric in some}
+    some = {'within_2px': 'within 2 px', 'longest_wrong_sure': 'wrong, said to be seen: pictures',
+            'visible_lost': 'visible, lost'}
+    return pd.DataFrame([{'film': film} | {line: round(float(
+        mine[mine.metric == metric].value.iloc[0]), 2) for metric, line in some.items()}
         for film, mine in rows.groupby('recording')])

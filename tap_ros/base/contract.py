@@ -34,6 +34,7 @@ CAMERA_SIZE = 256  # px of its pictures where people look at them; networks see 
 WORLD_FRAME = 'world'  # frame of positions and commands
 CAMERA_FRAME = 'camera_optical_frame'  # of pictures: z looks ahead, x right, y down (REP 103)
 
+MOST_LEVELS = 8  # keyframes of a demonstration, one for each subgoal in a row
 MOST_SIGNALS = 256  # numbers by name of an episode, beside what is known of the robot
 # Names of the gripper's state in joint states: metres, and the opening from 0 to 1.
 GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')

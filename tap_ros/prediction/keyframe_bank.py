@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from tap_ros.base.contract import MOST_LEVELS
 from tap_ros.base.errors import ConfigError, ImageError, WeightsError
 from tap_ros.base.text import escaped
 from tap_ros.images.drawing import png_bytes
@@ -33,7 +34,6 @@ from tap_ros.prediction.warp import one_hot_maps
 import torch
 
 MOST = 64  # demonstrations
-MOST_LEVELS = 8  # keyframes of each
 MOST_OBJECTS = 32  # whose places are kept
 NOWHERE = -1e6  # px; in a file: unknown
 MOST_BYTES = 2**28  # of all of them together, as rgb

@@ -45,6 +45,7 @@ class Picture:
 
     :param like: picture whose light this one is given, where all of it is lighter or of another
         tint, or None.
+    :ivar plane: Plane of its pixels.
     :ivar image: (h, w, 3) uint8.
     :ivar metric: Metric of lab and index.
     :ivar lab: (h, w, 3) uint8, lightness already weighed.
@@ -53,7 +54,8 @@ class Picture:
     """
 
     def __init__(self, view: View, plane: Plane, like: 'Picture | None' = None) -> None:
-        h, w = self.size = plane.working
+        self.plane, self.size = plane, plane.working
+        h, w = self.size
         image = view.image
         if image.shape[:2] != self.size:
             smaller = image.shape[0] > h or image.shape[1] > w
@@ -118,26 +120,17 @@ class Palette:
                 cv2.KMEANS_PP_CENTERS)
             shares = np.bincount(np.ravel(labels), minlength=FEW) / len(labels)
             centres = np.asarray(found)[shares >= min(least, shares.max())]
-        far = [sum(np.abs(axis - value) for axis, value in zip(metric.axes, centre)).ravel()
-               for centre in centres]
-        self._table, self._nearest = np.min(far, 0), np.argmin(far, 0).astype(np.uint8)
-        self._near = np.packbits(np.array(far) < NEAR, 0, 'little')[0]
+        self._far = np.array([sum(np.abs(axis - value) for axis, value in zip(
+            metric.axes, centre)).ravel() for centre in centres])
+        self._table = self._far.min(0)
 
     def distance(self, index: np.ndarray) -> np.ndarray:
         """Return the distances of colours by their index, any shape, float32."""
         return self._table.take(index)
 
-    def nearest(self, index: np.ndarray) -> np.ndarray:
-        """Return which of the colours is nearest, 0 to FEW - 1, by the index of another."""
-        return self._nearest.take(index)
-
     def recurs(self, index: np.ndarray, wanted: np.ndarray) -> float:
-        """
-        Return how alike the shares of each colour are, 0 to 1; shades of one stand for another.
-
-        :param index: of the colours of some points.
-        :param wanted: of others, which of the colours is nearest.
-        """
-        near = self._near.take(index)[..., None] >> np.arange(FEW) & 1
-        shares = np.bincount(wanted, minlength=FEW) / max(len(wanted), 1)
-        return float(np.minimum(near.reshape(-1, FEW).sum(0) / max(index.size, 1), shares).sum())
+        """Return how alike the shares of each colour are of some colours and of wanted ones."""
+        near = (self._far[:, index] < NEAR).mean(1)  # shades of one stand for another
+        nearest = self._far[:, wanted].argmin(0)
+        return float(np.minimum(near, np.bincount(nearest, minlength=len(near)) / len(
+            wanted)).sum())

@@ -11,7 +11,7 @@ from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.picture import FEW, Palette, Picture
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import View
-from tap_ros.tracking.registration import change, LEAST_SURE, locate
+from tap_ros.tracking.registration import CHANGED, LEAST_SURE, locate
 from tap_ros.tracking.silhouette import (
     centre,
     COMMON,
@@ -65,7 +65,7 @@ def _changed_objects(before: Picture, after: Picture) -> Iterator[np.ndarray]:
 
     What the robot hides in the other picture may have. Colours of the table are those around.
     """
-    may = change(before, after) | after.hidden & ~before.hidden
+    may = ((before.apart(after) > CHANGED) | after.hidden) & ~before.hidden
     for region in _parts(may)[:MOST_TRIED]:
         beside = (cv2.dilate(region.astype(np.uint8), np.ones((15, 15), np.uint8)) > may
                   ) & ~before.hidden
@@ -118,10 +118,10 @@ def _pieces(picture: Picture, mask: np.ndarray) -> list[np.ndarray]:
 def _located(before: Picture, after: Picture, plane: Plane, cut: Cut,
              masks: Sequence[np.ndarray]) -> list[Pose | None]:
     """Return where each mask of a picture is in another one; None where it is not."""
-    matcher, shown, found = Matcher(after.by(cut.metric), plane), before.by(cut.metric), []
+    matcher, shown, found = Matcher(after.by(cut.metric)), before.by(cut.metric), []
     for mask in masks:
         place = plane.of_top(centre(mask))
-        template = Template(shown, plane, mask, place, face=top_face(mask, plane))
+        template = Template(shown, mask, place, 0.0, top_face(mask, plane))
         pose = locate(matcher, template, extra=[place])
         found.append(pose if pose is not None and pose.confidence > LEAST_SURE else None)
     return found

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from tap_ros.base.contract import LOST, SEEN
 from tap_ros.tracking.picture import Picture
-from tap_ros.tracking.plane import EDGE, Plane
+from tap_ros.tracking.plane import EDGE
 from tap_ros.tracking.protocols import Tracked
 from tap_ros.tracking.template import Matcher, Pose, Template
 
@@ -37,7 +37,7 @@ def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (
     :param region: (h, w) weights of places, or None.
     :param extra: places that are tried, too.
     """
-    plane = matcher.plane
+    plane = matcher.picture.plane
     side = max(5.0, template.area ** 0.5)
     dense = cv2.GaussianBlur(matcher.likeness(template), (0, 0), side / 2.5)
     if region is not None:
@@ -76,20 +76,14 @@ def mean_shift(matcher: Matcher, template: Template,
     like = matcher.likeness(template)
     h, w = like.shape
     half = min(max(6, round(template.area ** 0.5 * 0.6)), h // 2, w // 2)
-    u, v = matcher.plane.top_pixels(place) - half
+    u, v = matcher.picture.plane.top_pixels(place) - half
     box = (int(np.clip(u, 0, w - 2 * half)), int(np.clip(v, 0, h - 2 * half)), 2 * half, 2 * half)
     _, (u, v, width, height) = cv2.meanShift((255 * like).astype(np.uint8), box, _STOP)
     amount = float(like[v:v + height, u:u + width].sum()) / template.area
-    return matcher.plane.of_top((u + half, v + half)), amount
+    return matcher.picture.plane.of_top((u + half, v + half)), amount
 
 
-def change(first: Picture, second: Picture) -> np.ndarray:
-    """Return which pixels differ between two pictures, the robot aside, (h, w) bool."""
-    return (first.apart(second) > CHANGED) & ~first.hidden & ~second.hidden
-
-
-def register(first: Picture, picture: Picture, plane: Plane,
-             objects: Sequence[Template]) -> Tracked:
+def register(first: Picture, picture: Picture, objects: Sequence[Template]) -> Tracked:
     """
     Find objects by a template of each, the one that fits best first.
 
@@ -98,7 +92,7 @@ def register(first: Picture, picture: Picture, plane: Plane,
     """
     changed = (first.apart(picture) > CHANGED).astype(np.float32)
     region = KEPT + cv2.GaussianBlur(changed, (0, 0), 4)
-    matchers = {one.metric: Matcher(picture.by(one.metric), plane) for one in objects}
+    matchers = {one.metric: Matcher(picture.by(one.metric)) for one in objects}
     found: dict[int, Pose] = {}
     for _ in objects:
         avoid = [pose.place for pose in found.values()]
@@ -108,7 +102,8 @@ def register(first: Picture, picture: Picture, plane: Plane,
             break
         best = min(tried, key=lambda k: tried[k].cost)
         found[best] = tried[best]
-    pixels, confidence = np.full((len(objects), 2), np.nan), np.zeros(len(objects))
+    plane, confidence = picture.plane, np.zeros(len(objects))
+    pixels = np.full((len(objects), 2), np.nan)
     states, outlines = [LOST] * len(objects), [np.zeros((0, 2))] * len(objects)
     for k, pose in found.items():
         confidence[k] = pose.confidence
@@ -116,5 +111,5 @@ def register(first: Picture, picture: Picture, plane: Plane,
             states[k] = SEEN
             pixels[k] = plane.enlarge(plane.middle_pixels(pose.place))
             outlines[k] = plane.enlarge(plane.top_pixels(
-                pose.template.outlined(pose.place, pose.angle)))
+                pose.template.placed(pose.template.outline, pose.place, pose.angle)))
     return Tracked(pixels, tuple(states), confidence, tuple(outlines))

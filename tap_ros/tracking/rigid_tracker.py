@@ -8,7 +8,7 @@ hides stays where it was; what was not found near by is searched everywhere.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,15 +19,7 @@ from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.registration import locate, mean_shift, register
-from tap_ros.tracking.silhouette import (
-    apart,
-    centre,
-    clicked,
-    OFF,
-    RADII,
-    silhouette,
-    top_face,
-)
+from tap_ros.tracking.silhouette import apart, centre, clicked, Cut, share, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
@@ -50,25 +42,26 @@ DOUBT = {HIDDEN: (0.88, 0.95), UNSURE: (0.5, 0.9), LOST: (0.5, 0.9)}
 PATIENCE = 2  # pictures in which what should be seen may be missed, before it is lost
 
 
-@dataclass
+@dataclass(eq=False)
 class _Object:
     """What is known of one object."""
 
     place: np.ndarray  # (2,) m
-    keys: list[Template]
+    keys: list[Template]  # the first one, and later ones that show other sides
     face: Template  # of its top alone, which looks alike from all sides
+    shown: Template  # that it was seen by last
     angle: float = 0.0
     state: str = SEEN
     age: int = 0  # pictures since it was seen
     confidence: float = 1.0
-    shown: Template = field(init=False)  # that it was seen by last
-    around: 'tuple[tuple[slice, slice], Picture] | None' = None  # window of it in which picture
+    searched: Picture | None = None  # in which it was found; None: it is not seen
     waits: int = 0  # pictures until it may be cut out anew
     sure: bool = True  # its middle is known, not only a click near it
     part: bool = False  # the robot hid a part of it so far
 
-    def __post_init__(self) -> None:
-        self.shown = self.keys[0]
+    def nearest(self) -> list[Template]:
+        """Return its templates, those first that show it turned like now."""
+        return sorted(self.keys, key=lambda key: _turned(self, key))
 
 
 class RigidTracker:
@@ -86,14 +79,7 @@ class RigidTracker:
 
     def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray,
                drawn: Sequence[np.ndarray] = ()) -> Tracked:
-        """
-        Follow other objects, from this picture on.
-
-        :param pixels: (K, 2) (u, v), a click on each object.
-        :param drawn: K outlines (N, 2), or N = 0 where the object is to be cut out; () for none.
-        :raises TrackingError: for a click outside the picture, on the robot, beyond the table, or
-            on nothing that differs from it; then those before are followed on.
-        """
+        """Follow other objects, from this picture on, see Tracker."""
         plane = Plane(self._camera, view.image.shape[:2])
         picture = Picture(view, plane)
         clicks = plane.shrink(np.reshape(pixels, (-1, 2)))
@@ -103,25 +89,27 @@ class RigidTracker:
             picture, click, np.delete(clicks, k, 0), names[k],
             plane.shrink(drawn[k]) if len(drawn) and len(drawn[k]) else None)
             for k, click in enumerate(clicks)])
-        objects = []
-        for click, cut, name in zip(clicks, cuts, names):
-            shown, mask, face = picture.by(cut.metric), cut.mask, top_face(cut.mask, plane)
-            sure = cut.whole and not cut.touched and cut.off(click) < OFF
-            # Of half an object, or two witnesses that contradict each other: half way.
-            share = 0.0 if not self._snap else 1.0 if sure else 0.5
-            place = (1 - share) * plane.of_middle(click) + share * plane.of_top(centre(face))
-            if plane.calibrated and not (np.abs(place) < EDGE).all():
+        objects = [self._object(picture, *one) for one in zip(cuts, clicks)]
+        for one, name in zip(objects, names):
+            if plane.calibrated and not (np.abs(one.place) < EDGE).all():
                 raise TrackingError(f'{name} is on nothing within {EDGE:g} m of the middle of the '
                                     'table, along x and y; click on an object')
-            objects.append(_Object(
-                place, [Template(shown, plane, mask, place)],
-                Template(shown, plane, mask, place, face=face), sure=sure, part=not cut.whole))
         self._objects, self._plane, self._first = objects, plane, picture
         self._gripper = view.gripper
         return self._tracked()
 
+    def _object(self, picture: Picture, cut: Cut, at: np.ndarray, angle: float = 0.0) -> _Object:
+        """Return what is known of an object that was cut out around a pixel."""
+        plane, sure = picture.plane, cut.sure(at)
+        # Of half an object, or two witnesses that contradict each other: half way.
+        way, face = 0.0 if not self._snap else 1.0 if sure else 0.5, top_face(cut.mask, plane)
+        place = way * plane.of_top(centre(face)) + (1 - way) * plane.of_middle(at)
+        first, top = (Template(picture.by(cut.metric), cut.mask, place, angle, part)
+                      for part in (None, face))
+        return _Object(place, [first], top, first, angle, sure=sure, part=not cut.whole)
+
     def update(self, view: View) -> Tracked:
-        """Follow into the next picture; return where the K objects are in it."""
+        """Follow into the next picture, see Tracker."""
         if not self._objects:
             return self._tracked()
         picture = Picture(view, self._plane, self._first)
@@ -133,50 +121,45 @@ class RigidTracker:
         return self._tracked()
 
     def find(self, view: View) -> Tracked:
-        """Find the objects in another picture; what is not found is LOST, and followed on."""
-        return register(self._first, Picture(view, self._plane, self._first), self._plane,
+        """Find the objects in another picture, see Tracker."""
+        return register(self._first, Picture(view, self._plane, self._first),
                         [one.face for one in self._objects])
 
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
         picture = picture.by(one.face.metric)
-        if one.age == 0 and one.around is not None and _still(*one.around, picture):
+        if one.searched is not None and self._still(one, one.searched, picture):
             return
-        one.around, one.waits = None, one.waits - 1
+        one.searched, one.waits = None, one.waits - 1
         if one.age and hand is not None:
             one.place = one.place + _pushed(one, hand)
-        matcher = Matcher(picture, self._plane, self._covered(one, picture))
-        keys = sorted(one.keys, key=lambda key: abs(_turned(key.angle - one.angle)))
-        pose = self._search(one, keys, matcher, hand)
+        matcher = Matcher(picture, self._covered(one, picture))
+        pose = self._search(one, matcher, hand)
         if pose is not None and pose.fit > GOOD:
             one.place, one.angle, one.shown = pose.place, pose.angle, pose.template
             one.age, one.confidence = 0, pose.confidence
             one.state = (SEEN if pose.sure else HIDDEN if pose.seen < 0.5 else UNSURE)
-            nearest = min(abs(_turned(other.angle - one.angle)) for other in one.keys)
-            one.around = self._window(one), picture
+            one.searched = picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
-                    one.part or pose.cost > NEW_COST or nearest > NEW_ANGLE):
+                    one.part or pose.cost > NEW_COST
+                    or _turned(one, one.nearest()[0]) > NEW_ANGLE):
                 self._cut_anew(one, picture)
             return
-        seen = matcher.score(keys[0], one.place[None], np.array([one.angle - keys[0].angle]))[1][0]
+        key = one.nearest()[0]
+        seen = matcher.score(key, one.place[None], np.array([one.angle - key.angle]))[1][0]
         one.age += 1
         one.state = HIDDEN if seen[0] < 0.5 else UNSURE if one.age <= PATIENCE else LOST
-        if one.state != HIDDEN and keys[0].contrast > COLOURFUL:
-            place, amount = mean_shift(matcher, keys[0], one.place)
+        if one.state != HIDDEN and key.contrast > COLOURFUL:
+            place, amount = mean_shift(matcher, key, one.place)
             if MOST[0] < amount < MOST[1]:  # lifted, or turned to a side not seen before
                 one.place, one.state = place, UNSURE
         first, fall = DOUBT[one.state]
         one.confidence = first * fall ** (one.age - 1)
 
-    def _search(self, one: _Object, keys: Sequence[Template], matcher: Matcher,
-                hand: np.ndarray | None) -> Pose | None:
-        """
-        Return the best pose near by, else anywhere.
-
-        :param keys: templates of the object, the nearest first.
-        """
+    def _search(self, one: _Object, matcher: Matcher, hand: np.ndarray | None) -> Pose | None:
+        """Return the best pose near by, else anywhere."""
         grown = 1 + 0.5 * min(one.age, 4)
-        reach, turn, push = REACH * grown, TURN * min(grown, 2), None
+        reach, turn, push = REACH * grown, TURN * min(grown, 2), np.zeros(2)
         if hand is not None:
             near = (hand[:, 2] < HAND_HIGH) & (
                 np.linalg.norm(hand[:, :2] - one.place, axis=1) < HAND_FAR)
@@ -184,16 +167,17 @@ class RigidTracker:
                 push = hand[1, :2] - hand[0, :2]
             elif one.age == 0:
                 reach, turn = REST, REST_TURN
+        keys = one.nearest()
         best = matcher.refine(keys[0], one.place, one.angle, reach, turn)
         if best is not None and best.fit > GOOD and best.cost < GOOD_COST:
             return best
-        others = [(one.place, key) for key in (*keys[1:2], one.face)]
-        if push is not None and np.linalg.norm(push) > 0.01:
-            others.append((one.place + push, keys[0]))
-        for place, key in others:
-            other = matcher.refine(key, place, one.angle, reach, turn)
-            if other is not None and (best is None or other.cost < best.cost - 0.03):
-                best = other
+        others = [(key, one.place) for key in (*keys[1:2], one.face)]
+        if np.linalg.norm(push) > 0.01:
+            others.append((keys[0], one.place + push))
+        for key, place in others:
+            pose = matcher.refine(key, place, one.angle, reach, turn)
+            if pose is not None and (best is None or pose.cost < best.cost - 0.03):
+                best = pose
         if one.age >= 1 and not (best is not None and best.fit > GOOD):
             avoid = [other.place for other in self._objects if other is not one]
             pose = locate(matcher, one.face, avoid)
@@ -211,12 +195,15 @@ class RigidTracker:
                 cv2.fillPoly(covered, [np.rint(self._outline(other)).astype(np.int32)], 1)
         return covered > 0
 
-    def _window(self, one: _Object) -> tuple[slice, slice]:
-        """Return the part of the working picture that shows an object and what is next to it."""
-        pixels = self._outline(one)
-        (u, v), (right, low) = pixels.min(0).astype(int), pixels.max(0).astype(int)
-        return np.s_[max(v - BESIDE, 0):max(low + BESIDE, 0), max(u - BESIDE, 0):max(
-            right + BESIDE, 0)]
+    def _still(self, one: _Object, before: Picture, now: Picture) -> bool:
+        """Tell whether two pictures show the same of an object and of what is next to it."""
+        outline = self._outline(one)
+        u, v = (outline.min(0).astype(int) - BESIDE).clip(0)
+        right, low = (outline.max(0).astype(int) + BESIDE).clip(0)
+        window = np.s_[v:low, u:right]
+        apart = np.asarray(cv2.absdiff(before.lab[window], now.lab[window]))
+        return not (before.hidden[window] != now.hidden[window]).any() and (
+            apart > SAME).mean() < 0.003
 
     def _cut_anew(self, one: _Object, picture: Picture) -> None:
         """
@@ -224,32 +211,23 @@ class RigidTracker:
 
         That of an object of which a part was seen so far is of all of it, and corrects its place.
         """
+        one.waits, outline = WAITS, self._outline(one)
+        before = cv2.fillPoly(np.zeros(picture.size, np.uint8), [np.rint(outline).astype(int)], 1)
+        if share(before, picture.hidden):
+            return
         at, *others = self._plane.middle_pixels([one.place, *(
             other.place for other in self._objects if other is not one)])
-        one.waits = WAITS
-        outline = self._outline(one)
-        before = cv2.fillPoly(np.zeros(picture.size, np.uint8), [np.rint(outline).astype(int)], 1)
-        if _reaches(before, picture.hidden):
-            return
-        radius = min(float(np.linalg.norm(outline - at, axis=1).max()) * 1.4 + 4, RADII[1])
+        radius = 1.4 * float(np.linalg.norm(outline - at, axis=1).max()) + 4
         cut = silhouette(picture, at, others, 0.0 if one.part else radius)
-        mask = cut.mask
-        if _reaches(mask.astype(np.uint8), picture.hidden):
+        if share(cut.mask, picture.hidden):
             return
-        if not one.part:
-            if 0.6 < mask.sum() / one.keys[0].area < 1.6 and one.keys[0].palette.recurs(
-                    picture.index[mask], one.keys[0].kinds) > RECURS:
-                key = Template(picture, self._plane, mask, one.place, one.angle)
-                one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
-            return
-        if cut.whole and not cut.touched and cut.off(at) < OFF and (
-                before[mask].sum() > SHARED * before.sum()):
-            face, one.part, one.sure = top_face(mask, self._plane), False, True
-            if self._snap:
-                one.place = self._plane.of_top(centre(face))
-            one.shown = Template(picture, self._plane, mask, one.place, one.angle)
-            one.keys = [one.shown]
-            one.face = Template(picture, self._plane, mask, one.place, one.angle, face)
+        if not one.part and 0.6 < cut.mask.sum() / one.keys[0].area < 1.6 and (
+                one.keys[0].palette.recurs(
+                    picture.index[cut.mask], one.keys[0].indices) > RECURS):
+            key = Template(picture, cut.mask, one.place, one.angle)
+            one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
+        elif one.part and cut.sure(at) and before[cut.mask].sum() > SHARED * before.sum():
+            self._objects[self._objects.index(one)] = self._object(picture, cut, at, one.angle)
 
     def _tracked(self) -> Tracked:
         """Return where the objects are."""
@@ -261,19 +239,8 @@ class RigidTracker:
             tuple(self._plane.enlarge(self._outline(one)) for one in self._objects))
 
     def _outline(self, one: _Object) -> np.ndarray:
-        return self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
-
-
-def _still(window: tuple[slice, slice], before: Picture, now: Picture) -> bool:
-    if (before.hidden[window] != now.hidden[window]).any():
-        return False
-    apart = cv2.absdiff(before.lab[window], now.lab[window])
-    return bool((np.asarray(apart) > SAME).mean() < 0.003)
-
-
-def _reaches(mask: np.ndarray, hidden: np.ndarray) -> bool:
-    """Tell whether the robot hides anything next to a mask, both (h, w)."""
-    return bool((cv2.dilate(mask, np.ones((7, 7), np.uint8)) > 0)[hidden].any())
+        return self._plane.top_pixels(
+            one.shown.placed(one.shown.outline, one.place, one.angle))
 
 
 def _pushed(one: _Object, hand: np.ndarray) -> np.ndarray:
@@ -283,12 +250,12 @@ def _pushed(one: _Object, hand: np.ndarray) -> np.ndarray:
     if hand[:, 2].max() > TOP or not length:
         return np.zeros(2)
     along, aside = way / length, np.array([-way[1], way[0]]) / length
-    c, s = np.cos(one.angle - one.face.angle), np.sin(one.angle - one.face.angle)
-    points = one.place + one.face.points @ np.array([[c, s], [-s, c]]) - hand[1, :2]
+    points = one.face.placed(one.face.points, one.place, one.angle) - hand[1, :2]
     met = points[np.abs(points @ aside) < HAND_HALF] @ along
     met = met[met > -length - HAND_HALF]  # what is behind the hand stays there
     return along * np.clip(HAND_HALF - met.min(initial=HAND_HALF), 0, length)
 
 
-def _turned(angle: float) -> float:
-    return float(np.angle(np.exp(1j * angle)))
+def _turned(one: _Object, key: Template) -> float:
+    """Return by how much an object is turned from where a template shows it, rad."""
+    return float(np.abs(np.angle(np.exp(1j * (one.angle - key.angle)))))

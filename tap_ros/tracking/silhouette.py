@@ -45,6 +45,10 @@ class Cut:
         """Return the distance of its middle from a pixel, inf where nothing was cut out."""
         return float(np.linalg.norm(centre(self.mask) - at)) if self.mask.any() else np.inf
 
+    def sure(self, at: np.ndarray) -> bool:
+        """Tell whether it is all of an object that was clicked at a pixel, and nothing else."""
+        return self.whole and not self.touched and self.off(at) < OFF
+
 
 def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.ndarray = (),
                radius: float = 0.0) -> Cut:
@@ -56,12 +60,12 @@ def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | 
     :param radius: px, up to which it is searched; 0: as far as it reaches, see RADII.
     """
     if radius:
-        return _cut(picture, at, others, radius)
+        return _cut(picture, at, others, min(radius, RADII[1]))
     near, far = RADII
     cut = _cut(picture, at, others, near)
-    if not cut.contrast or _share(cut.mask, _beyond(picture, at, near - 2)) > ENDS:
+    if not cut.contrast or share(cut.mask, _beyond(picture, at, near - 2)) > ENDS:
         large = _cut(picture, at, others, far)
-        if large.contrast and not _share(large.mask, _beyond(picture, at, far - 2)) > ENDS:
+        if large.contrast and not share(large.mask, _beyond(picture, at, far - 2)) > ENDS:
             cut = large
     if cut.off(at) > NEARER:  # another one may touch it
         alone = _cut(picture, at, others, near, alone=True)
@@ -96,8 +100,8 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     if not ring.any():
         return nothing
     image = picture.image[window]
-    hue = np.min([Palette(shaded(image[ring][:, None], share), least=COMMON).distance(
-        picture.index[window]) for share in SHADES], 0)
+    hue = np.min([Palette(shaded(image[ring][:, None], light), least=COMMON).distance(
+        picture.index[window]) for light in SHADES], 0)
     light = picture.by(LIGHT).lab[window][..., 0].astype(np.float32)
     dark, bright = np.percentile(light[ring], (100 - LIGHTEST, LIGHTEST))
     unlike = hue + np.maximum(light - bright, 0) + np.maximum(dark * SHADES[-1] - light, 0)
@@ -138,7 +142,7 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     contrast, colour = (float(np.median(one[found > 0])) for one in (unlike, hue))
     believed = contrast > SPREAD * np.median(unlike[ring])
     return Cut(empty, contrast if believed else 0.0, COLOUR if colour > COLOURFUL else LIGHT,
-               _share(empty, picture.hidden | _beyond(picture, at, radius - 2)) <= TOUCHING)
+               share(empty, picture.hidden | _beyond(picture, at, radius - 2)) <= TOUCHING)
 
 
 def _beyond(picture: Picture, at: np.ndarray, radius: float) -> np.ndarray:
@@ -149,7 +153,7 @@ def _beyond(picture: Picture, at: np.ndarray, radius: float) -> np.ndarray:
     return np.asarray((np.hypot(x - at[0], y - at[1]) > radius) | edge)
 
 
-def _share(mask: np.ndarray, ends: np.ndarray) -> float:
+def share(mask: np.ndarray, ends: np.ndarray) -> float:
     """Return the share of the rim of a mask that is next to other pixels, both (h, w) bool."""
     rim = (cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~cv2.erode(
         mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
@@ -180,7 +184,7 @@ def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
     if line is not None:
         mask = cv2.fillPoly(np.zeros(picture.size, np.uint8), [
             np.rint(line).clip(-999, 999).astype(int)], 1) > 0
-        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, _share(mask, picture.hidden) <= TOUCHING)
+        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, share(mask, picture.hidden) <= TOUCHING)
     else:
         cut = silhouette(picture, at, others)
     if cut.mask.sum() < LEAST_AREA or cut.contrast < LEAST_CONTRAST:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import math
 from typing import Annotated, Literal
 
+from tap_ros.base.contract import MOST_LEVELS
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import Folder
 from tap_ros.images.robot_mask import RobotMask
-from tap_ros.prediction.keyframe_bank import MOST_LEVELS
 from tap_ros.recording.reading import Topics
 from tap_ros.training.run_config import RunConfig
 from tyro import conf

@@ -31,7 +31,7 @@ from tap_ros.ros.parameters import Parameters, pose_matrix
 from tap_ros.ros.subscriptions import adapt_regularly, AdaptiveSubscription, publishers_of
 from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, STREAM
 from tap_ros.tracking.plane import check_pose, Plane
-from tap_ros.tracking.protocols import Tracker, View
+from tap_ros.tracking.protocols import Tracked, Tracker, View
 
 MOST_POINTS = 1000  # of an outline; OpenCV fills one of 100 000 for minutes
 
@@ -219,20 +219,28 @@ def drawn_in(request: SelectObjects.Request) -> list[np.ndarray]:
     return drawn
 
 
-def accepted(tracker: Tracker, view: View, clicks: np.ndarray,
-             drawn: Sequence[np.ndarray]) -> tuple[list[int], dict[int, TrackingError]]:
-    """Return which clicks are on objects, and why others are refused; TrackingError for all."""
-    why: dict[int, TrackingError] = {}
-    for k in range(len(clicks)):
+def select(tracker: Tracker, view: View, clicks: np.ndarray, drawn: Sequence[np.ndarray]
+           ) -> tuple[list[int], dict[int, TrackingError], Tracked]:
+    """
+    Follow what is clicked.
+
+    :return: which clicks are on objects, why others are refused, and where the objects are.
+    :raises TrackingError: where all are refused.
+    """
+    kept, why = list(range(len(clicks))), dict[int, TrackingError]()
+    with suppress(TrackingError):
+        return kept, why, tracker.select(view, clicks, *_picked(drawn, kept))
+    for k in kept:
         try:
-            tracker.select(view, clicks[[k]], *picked(drawn, [k]))
+            tracker.select(view, clicks[[k]], *_picked(drawn, [k]))
         except TrackingError as error:
             why[k] = error
     if len(why) == len(clicks):
         raise next(iter(why.values()))
-    return [k for k in range(len(clicks)) if k not in why], why
+    kept = [k for k in kept if k not in why]
+    return kept, why, tracker.select(view, clicks[kept], *_picked(drawn, kept))
 
 
-def picked(drawn: Sequence[np.ndarray], kept: Sequence[int]) -> tuple[list[np.ndarray], ...]:
+def _picked(drawn: Sequence[np.ndarray], kept: Sequence[int]) -> tuple[list[np.ndarray], ...]:
     """Return what select is given beside clicks: some trackers know no outlines."""
     return ([drawn[k] for k in kept],) if drawn else ()

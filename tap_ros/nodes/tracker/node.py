@@ -22,7 +22,7 @@ from tap_ros.messages.images import is_empty
 from tap_ros.messages.objects import decode_objects, MAX_OBJECTS
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE
-from tap_ros.nodes.tracker.inputs import accepted, drawn_in, picked, TrackerInputs
+from tap_ros.nodes.tracker.inputs import drawn_in, select, TrackerInputs
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.ros.calls import answering, log_error
 from tap_ros.ros.observations import Moment
@@ -143,10 +143,9 @@ class TrackerNode(Node):
                 f'{others} other nodes publish on {self.resolve_topic_name("objects")}; end '
                 'them, or start the simulator with objects:=tracked')
         tracker: Tracker = self._make(camera)
-        kept, why = accepted(tracker, view, clicks, drawn)
+        kept, why, tracked = select(tracker, view, clicks, drawn)
         refused = [f'{escaped(name)}: {why[k]}' for k, name in enumerate(found) if k in why]
         found = tuple(found[k] for k in kept)
-        tracked = tracker.select(view, clicks[kept], *picked(drawn, kept))
         said = '; '.join([f'following {listing(found)}', *refused])
         message = self._encode(found, tracked, plane, moment.messages['image'].header)
         self._selection = Selection(
