@@ -188,11 +188,11 @@ def mark(folder, ways=()):
 
 
 def mark_times(folder, count):
-    """Mark all demonstrations half way in time, at half of that, and so on; return the file."""
+    """Mark all demonstrations at equal shares of their time, of one half way; return the file."""
     store = open_recordings([folder])
     path = Path(folder, 'times.json')
     write_marks(path, store, [folder], {
-        i: [(t, t) for t in sorted(int(length) >> n for n in range(1, count + 1))]
+        i: [(int(length) * n // (count + 1),) * 2 for n in range(1, count + 1)]
         for i, length in enumerate(store.lengths)})
     return path
 
@@ -264,12 +264,12 @@ def write_results(runs, out, args):
 
 
 def ahead(rows):
-    """Say by how many points the subgoal succeeds more often than others, in the same scenes."""
+    """Say by how many points the subgoal is ahead of the others that plan, in the same scenes."""
     if not any(row['method'] == 'subgoal' for row in rows):
         return {}
     ends, found = pd.DataFrame(rows).pivot_table(
         'ends', ['task', 'seed'], 'method', lambda those: those.mean()), {}
-    for other in sorted(set(ends) - {'subgoal'}):
+    for other in [method for method in PLANNED[:-1] if method in ends]:
         both = 100 * ends[['subgoal', other]].dropna().astype(float)
         if len(both):
             found[other] = '{:+.0f} points ({:+.0f} to {:+.0f})'.format(

@@ -58,11 +58,20 @@ def test_marked_is_where_the_first_object_rests_at_its_goal_and_the_other_has_no
     assert first == last and first in (3, 4)
 
 
-def test_a_fixed_time_is_marked_half_way_and_at_a_quarter_in_every_demonstration(tmp_path):
+def test_a_fixed_time_is_marked_at_equal_shares_of_every_demonstration(tmp_path):
     bag = write_moves(tmp_path, [[4, 4]] * 9, ('success', 'failure'))
     marks = read_marks(loop.mark_times(bag, 2), open_recordings([bag])).episodes
     assert {i: list(map(tuple, those)) for i, those in marks.items()} == dict.fromkeys(
-        (0, 1), [(2, 2), (4, 4)])
+        (0, 1), [(3, 3), (6, 6)])
+
+
+def test_points_ahead_are_told_of_scenes_that_both_ran():
+    rows = [{'task': 'push-wall-v3', 'seed': seed, 'method': method, 'ends': ends}
+            for seed in range(4) for method, ends in (
+                ('direct', False), ('random', True), ('subgoal', seed > 0), ('subgoal', seed > 1))]
+    alone = [{**rows[0], 'seed': seed, 'ends': True} for seed in range(5, 9)]
+    assert loop.ahead(rows + alone) == {'direct': '+62 points (+25 to +100)'}
+    assert loop.ahead(rows[:2]) == loop.ahead([]) == {}
 
 
 def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
