@@ -92,6 +92,11 @@ def _bench_start():
     return Command(Options, run)
 
 
+def _bench_busy():
+    from experiments.bench.busy import Options, run
+    return Command(Options, run)
+
+
 def _bench_all():
     from experiments.bench.everything import Options, run
     return Command(Options, run)
@@ -117,6 +122,7 @@ LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weight
         'planning': ('time of a plan', _bench_planning),
         'service': ('time of an answer of the predictor node', _bench_service),
         'start': ('time until all nodes are ready', _bench_start),
+        'busy': ('the same beside busy processes', _bench_busy),
         'all': ('one after the other, into a file', _bench_all)})})
 
 if __name__ == '__main__':

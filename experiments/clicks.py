@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 
+from experiments.planning.following import CAMERA_SIZE, SLIP, slip
 from experiments.tracks import fit_camera, RIGHT, SIDE, WRONG
 import numpy as np
 from sim_bridge.simulator import Simulator
@@ -17,8 +18,6 @@ from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.protocols import View
 from tap_ros.tracking.rigid_tracker import RigidTracker
 
-SIZE = 256  # px of pictures
-SLIP = 5.0  # px, within which a click is off
 BODY, COVERED = 10.0, (0.2, 0.6)  # px around an object's middle; share of these behind the robot
 EVERY, FOLLOWED = 3, 12  # pictures from one click to the next; in which it is followed then
 LIFT = 30.0, 45.0  # levels of 255 that objects are lighter than the table
@@ -26,7 +25,7 @@ LIFT = 30.0, 45.0  # levels of 255 that objects are lighter than the table
 
 def score_covered(bags):
     """
-    Click on objects of bags of SIZE px while the robot hides a part of them, and follow them.
+    Click on objects of bags while the robot hides a part of them, and follow them.
 
     :return: rows of _rows; 'later' is of the last picture in which an object is followed.
     """
@@ -39,14 +38,14 @@ def score_covered(bags):
                 for true in np.swapaxes(episode.object_pixels[t:t + FOLLOWED], 0, 1):
                     mask = episode.robot_masks[t]
                     if COVERED[0] <= _share_hidden(mask, true[0]) <= COVERED[1]:
-                        click = nearest_free((true[0] + _slip(rng))[None], mask)
+                        click = nearest_free((true[0] + slip(rng))[None], mask)
                         found.append(_follow(RigidTracker(camera), episode, t, click, true))
     return _rows(found, 'half hidden')
 
 
 def score_pale(task, look, seeds):
     """Click on objects that differ from the table in lightness alone; return rows of _rows."""
-    simulator, found = Simulator(task, SIZE, look=look), []
+    simulator, found = Simulator(task, CAMERA_SIZE, look=look), []
     try:
         for seed in seeds:
             rng = np.random.default_rng([seed, 7])
@@ -63,7 +62,7 @@ def score_pale(task, look, seeds):
                     continue
                 try:
                     tracked = RigidTracker(camera).select(
-                        View(seen.image, seen.robot_mask), [pixel + _slip(rng)])
+                        View(seen.image, seen.robot_mask), [pixel + slip(rng)])
                 except TrackingError:
                     found.append(None)
                     continue
@@ -110,18 +109,12 @@ def _rows(found, name):
         'confidence_at_once': bootstrap(lambda x: np.mean(x, -1), confidence)}
     return [{'recording': name, 'metric': metric, 'step': 0, 'value': round(float(value), 4),
              'ci_low': round(float(low), 4), 'ci_high': round(float(high), 4), 'n': len(found),
-             'tracker': 'rigid', 'click_px': SLIP * SIDE / SIZE, 'size': SIZE}
+             'tracker': 'rigid', 'click_px': SLIP * SIDE / CAMERA_SIZE, 'size': CAMERA_SIZE}
             for metric, (value, low, high) in stated.items()]
 
 
-def _slip(rng):
-    """Return how far (2,) px a click is off, even over a disc."""
-    angle = rng.uniform(0, 2 * np.pi)
-    return SLIP * np.sqrt(rng.uniform()) * np.array([np.cos(angle), np.sin(angle)])
-
-
 def _off(tracked, true):
-    return float(np.linalg.norm(tracked.pixels[0] - true) * SIDE / SIZE)
+    return float(np.linalg.norm(tracked.pixels[0] - true) * SIDE / CAMERA_SIZE)
 
 
 def _around(shape, pixel, near, far):

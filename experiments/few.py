@@ -208,4 +208,4 @@ def page(found):
     return render('templates/few.md.j2', task=found['task'], marked=MARKED, held_out=HELD_OUT,
                   steps=SETTINGS['steps'], batch=SETTINGS['batch_size'],
                   seeds=1 + max(row['seed'] for row in found['curve']),
-                  table=markdown(lines(found)), patience=REAL['patience'], real=real)
+                  table=markdown(lines(found)), real=real)

@@ -10,8 +10,8 @@ import numpy as np
 from tap_ros.apps.label_command import describe_all, Signals, WITHIN_S
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import File, Folder
-from tap_ros.recording.reading import Topics
-from tap_ros.training.labels import Film, label
+from tap_ros.recording.reading import Reading, Topics
+from tap_ros.training.labels import Film, label, SIZE
 from tqdm import tqdm
 
 
@@ -47,7 +47,8 @@ def run(options: Options) -> None:
 
     :raises ConfigError: for a truth of other demonstrations.
     """
-    store, films = describe_all(options.recordings, options.image_topic, options.signals)
+    store, films = describe_all(options.recordings, Reading(
+        options.image_topic, crop='whole', size=SIZE), options.signals)
     truth = json.loads(Path(options.truth).read_text())
     if len(truth) != len(store):
         raise ConfigError(f'truth: {len(truth)} episodes, and the recordings have {len(store)}')

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The examples of docs/python.md; with those of docs/extending.md one for each name of tap_ros."""
+"""The examples of docs/python.md; with those of parts one for each name of tap_ros."""
 
 from pathlib import Path
 import re
@@ -9,7 +9,8 @@ import tap_ros
 
 DOCS = Path(__file__).parents[1] / 'docs'
 PAGE = (DOCS / 'python.md').read_text()
-SHOWN = PAGE + (DOCS / 'extending.md').read_text()
+SHOWN = PAGE + (DOCS / 'extending.md').read_text() + ''.join(
+    path.read_text() for path in DOCS.parent.glob('examples/**/*.py'))
 BLOCKS = re.findall(r'^```python\n(.*?)^```$', PAGE, re.M | re.S)
 
 

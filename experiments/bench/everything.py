@@ -14,7 +14,8 @@ import time
 from tap_ros.base.files import write_atomically
 import torch
 
-PARTS = ('collect', 'recording', 'growth', 'training', 'planning', 'nodes.service', 'nodes.start')
+PARTS = ('collect', 'recording', 'growth', 'training', 'planning', 'nodes.service', 'nodes.start',
+         'busy')
 
 
 @dataclass(frozen=True)

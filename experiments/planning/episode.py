@@ -65,7 +65,8 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
 
     :param mpc: VisualMPC, with the forward model that the method names.
     :param predictor: SubgoalPredictor, for methods that predict.
-    :param reached: px, mean over objects; nearer than this is there. 0: never.
+    :param reached: px, mean over objects; nearer than this is there, 0: never. Or of the goal and
+        of subgoals, (2,).
     :return: PlannedEpisode.
     """
     if method.predicted and predictor is None:
@@ -75,8 +76,9 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
     view = FreeView(getattr(mpc.model, 'robot_mask', 'none'))
     asked = FreeView(shown_mask(predictor) if method.predicted else 'none')
     subgoals, refused, aborted = [], '', ''
-    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, rounds=method.rounds),
-                  seed)
+    reached, passed = np.broadcast_to(reached, 2).tolist()
+    reach = Reach(mpc, ReachConfig(
+        step_budget, method.switch, reached, rounds=method.rounds, passed=passed), seed)
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
     tracked, states, true_goal, follower = [], (), goal, None
     if method.tracking != 'ground_truth':

@@ -16,7 +16,7 @@ from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.protocols import View
 
 CAMERA_SIZE = 256  # px, what objects are followed in
-CLICK_ERROR = 1.35  # px of 64, mean distance of a click from the middle of an object
+SLIP = 5.0  # px of it, up to which a click is off the middle of an object
 CLICKS = 5  # at most
 _camera = lru_cache(Simulator)  # takes the pictures that objects are followed in
 
@@ -46,10 +46,9 @@ class Follower:
         """Click on the objects; return the Observation with tracked pixels, and the states."""
         view, self._rng = _view(self._camera.reset(seed)), np.random.default_rng([seed, 0])
         for _ in range(CLICKS):  # who is refused clicks again
-            clicks = (seen.object_pixels + self._slips(seen) + 0.5) * self._scale - 0.5
             try:
                 return self._told(seen, self._tracker.select(
-                    view, nearest_free(clicks, view.robot_mask)))
+                    view, nearest_free(self._clicks(seen), view.robot_mask)))
             except TrackingError as refusal:
                 reason = refusal
         raise reason
@@ -65,17 +64,24 @@ class Follower:
         told = self._told(goal, found)[0]
         lost = np.array([state == LOST for state in found.states])
         self.placed = [name for name, is_lost in zip(goal.object_names, lost) if is_lost]
-        clicks = goal.object_pixels + self._slips(goal)
         return replace(told, object_pixels=np.where(
-            lost[:, None], clicks, told.object_pixels).astype(np.float32))
+            lost[:, None], self._shrunk(self._clicks(goal)), told.object_pixels))
 
-    def _slips(self, observation):
-        return self._rng.normal(
-            0, CLICK_ERROR / np.sqrt(np.pi / 2), observation.object_pixels.shape)
+    def _clicks(self, observation):
+        true = (observation.object_pixels + 0.5) * self._scale - 0.5
+        return true + [slip(self._rng) for _ in true]
+
+    def _shrunk(self, pixels):
+        return ((pixels + 0.5) / self._scale - 0.5).astype(np.float32)
 
     def _told(self, observation, tracked):
-        pixels = (tracked.pixels + 0.5) / self._scale - 0.5
-        return replace(observation, object_pixels=pixels.astype(np.float32)), tracked.states
+        return replace(observation, object_pixels=self._shrunk(tracked.pixels)), tracked.states
+
+
+def slip(rng):
+    """Return how far (2,) px of CAMERA_SIZE a click is off, even over a disc."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return SLIP * np.sqrt(rng.uniform()) * np.array([np.cos(angle), np.sin(angle)])
 
 
 def _view(picture):

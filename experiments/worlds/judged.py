@@ -35,9 +35,9 @@ SUBGOALS = {'push-wall-v3': 2, 'ogbench/cube-double': 1}  # so many
 BUDGETS = {'push-wall-v3': 55, 'ogbench/cube-double': 70}  # commands; else contract.step_budget
 # Half of what is usual, so that a plan takes half the time.
 PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threads=1)
-# px, here about cm: within this, the object is where it shall be. A hand that is pushing goes on
-# by 2 cm as it is lifted; chosen in scenes 900000 to 900003, which do not count.
-REACHED = {'push-wall-v3': 3.5}
+# px, here about cm: within this the object is at its goal, and at a subgoal. What is pushed slides
+# on, by 2 to 5 cm; chosen in scenes 900000 to 900003, which do not count.
+REACHED = {'push-wall-v3': (3.5, 6.0)}
 USUAL = 2.0  # elsewhere, chosen in scenes 1000000 to 1000005, which do
 ENDS = 'direct', 'subgoal', 'retrieval', 'places'  # that are drawn
 FILM_SIZE, FRAME_MS, HOLD_MS = 256, 120, 3000  # pixels; of each picture, of the last one

@@ -15,7 +15,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from tap_ros.base.contract import GRIPPER_JOINTS
+from tap_ros.base.contract import GRIPPER_JOINTS, object_names
 
 SHAPES = ('L', 'T', 'bar', 'disc')
 HALF_HEIGHT = 0.03  # m, of every object
@@ -82,11 +82,6 @@ def random_shape(rng: np.random.Generator, thin: bool = False) -> ObjectShape:
     areas = np.array([bar[0] * bar[1], arm[0] * arm[1]])
     centroid = arm_centre * areas[1] / areas.sum()
     return ObjectShape(kind, (bar, arm), (tuple(-centroid), tuple(arm_centre - centroid)), colours)
-
-
-def object_names(count: int) -> tuple[str, ...]:
-    """Return the names of the objects, in order: object_0, object_1, ..."""
-    return tuple(f'object_{i}' for i in range(count))
 
 
 def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False) -> mujoco.MjModel:

@@ -18,12 +18,16 @@ from sim_bridge.world.scene import (
     build_scene,
     FINGER_TRAVEL,
     HALF_HEIGHT,
-    object_names,
     ObjectShape,
     TIMESTEP,
 )
 from sim_bridge.world.studio import Studio
-from tap_ros.base.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.base.contract import (
+    CONTROL_PERIOD,
+    object_names,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+)
 from tap_ros.base.errors import KinematicsError, SceneError
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 

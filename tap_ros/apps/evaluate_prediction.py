@@ -95,7 +95,8 @@ def run(args: Options) -> None:
     if len(learned) and training.get('data_hash') == store.data_hash:
         seen = evaluate(network, store, learned[:max(len(episodes), _SEEN)], args.goal_picture,
                         filled)['prediction']
-    words = verdict(scores['prediction'], seen)
+    words = verdict(scores['prediction'], seen, *(
+        ['all episodes, also those trained on'] if args.all or not training else []))
     if seen is None and not args.all:
         words.append('training episodes: they are not among these recordings, so nothing tells '
                      'whether they were memorised')
@@ -169,8 +170,9 @@ def _read_marks(path: str, store: EpisodeStore, episodes: np.ndarray) -> Marks |
     marks = read_marks(path, store) if path else None
     if marks and marks.episodes.keys().isdisjoint(episodes.tolist()):
         raise ConfigError(
-            'marks: none of the episodes that are scored is marked; mark some of them, in the '
-            f'order of the recordings from 0: {listing(episodes)}; or give --all')
+            'marks: none of the episodes that are scored is marked; mark some of them now, after '
+            f'the training, in the order of the recordings from 0: {listing(episodes)}; --all '
+            'also scores those that were trained on')
     return marks
 
 

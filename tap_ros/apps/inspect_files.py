@@ -51,8 +51,11 @@ def run(args: Options) -> None:
     :raises TapError: for what cannot be read, and for a recording that `train` would refuse.
     """
     if Path(args.path).suffix == '.safetensors':
-        from tap_ros.weights.weights import load_tensors  # torch takes seconds
-        _, about = load_tensors(args.path)
+        from tap_ros.prediction.keyframe_bank import KeyframeBank  # torch takes seconds
+        from tap_ros.weights.weights import load_tensors
+        tensors, about = load_tensors(args.path)
+        if bank := KeyframeBank.take(tensors, args.path):
+            about['recorded_pictures'] = len(bank)  # frames of demonstrations, to be copied from
         print(json.dumps(about, indent=2))
         return
     bags = find_bags(args.path)

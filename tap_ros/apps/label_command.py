@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros label`: from ten marks to a label in every demonstration."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import io
 import json
 from pathlib import Path
@@ -15,16 +15,22 @@ import numpy as np
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File, Folder
 from tap_ros.base.progress import Progress
-from tap_ros.base.text import listing
+from tap_ros.base.text import escaped, listing
 from tap_ros.evaluation.intervals import share_interval
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.bags import find_bags, Paths
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.events import Event, write_events
-from tap_ros.recording.formats.lerobot_subtasks import Ends, segment_names, write_subtasks
+from tap_ros.recording.formats.lerobot_subtasks import (
+    describe_set,
+    Ends,
+    segment_names,
+    UNLABELLED,
+    write_subtasks,
+)
 from tap_ros.recording.marks import beside, Mark, numbered, read_marks, write_marks
 from tap_ros.recording.metadata import FILE_NAME
-from tap_ros.recording.reading import Reading, Topics
+from tap_ros.recording.reading import Reading, reading_of, ReadingOptions
 from tap_ros.training.films import film_together, signals_like
 from tap_ros.training.labels import Film, label, Labels, SIZE
 from tyro import conf
@@ -40,6 +46,19 @@ Signals = Annotated[tuple[str, ...], conf.arg(
 
 
 @dataclass(frozen=True)
+class WholeReading(ReadingOptions):
+    """
+    Where demonstrations are cut, and which of their pictures count.
+
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+        Of several all count; labels.png shows the first.
+    """
+
+    crop: Annotated[str, conf.Fixed, conf.Suppress] = 'whole'
+    size: Annotated[int, conf.Fixed, conf.Suppress] = SIZE
+
+
+@dataclass(frozen=True)
 class Options:
     """
     Options of the command.
@@ -48,20 +67,20 @@ class Options:
     :param marks: file of `python -m tap_ros mark`; by default the one beside the first recording.
     :param out: folder for labels.json, labels.csv, labels.png, labels.marks.json, the labels as
         marks, and of each bag an MCAP file that viewers open together with it.
-    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
-        Of several all count; labels.png shows the first.
-    :param signals: parts of names of signals that count beside the pictures, such as Hand.
+    :param signals: parts of names of signals that count beside the pictures, such as Hand; '' is a
+        part of each name.
     :param write_lerobot: the LeRobot data set from which the recording was imported: its rows get
-        the subtasks that the labels tell apart.
+        the subtasks that the labels tell apart, instead of those that it has; rows of
+        demonstrations without labels get one called unlabelled.
     """
 
     recordings: Annotated[conf.Positional[tuple[str, ...]], conf.arg(
         metavar='BAG [BAG ...]', help_behavior_hint='(required)')]
     out: Folder
     marks: File = ''
-    image_topic: Topics = ()
     signals: Signals = ()
     write_lerobot: Folder = ''
+    reading: WholeReading = WholeReading()
 
 
 def run(options: Options) -> None:
@@ -70,7 +89,9 @@ def run(options: Options) -> None:
 
     :raises TapError: for recordings or marks that cannot be used.
     """
-    store, films = describe_all(options.recordings, options.image_topic, options.signals)
+    known, indices = describe_set(options.write_lerobot) if options.write_lerobot else ({}, {})
+    store, films = describe_all(
+        options.recordings, reading_of(options.reading), options.signals)
     path = Path(options.marks) if options.marks else beside(options.recordings[0])
     marks = read_marks(path, store)
     marked = {i: store.seconds(i)[[(first + last) // 2 for first, last in those]]
@@ -90,9 +111,9 @@ def run(options: Options) -> None:
     write_atomically(out / 'labels.json', json.dumps({
         'names': names, 'marks': marks.digest, 'labels': rows}, indent=1) + '\n')
     write_atomically(out / 'labels.csv', to_csv(rows))
-    write_marks(out / 'labels.marks.json', store, options.recordings, {
-        i: those for i in range(len(store)) if (
-            those := marks.episodes.get(i) or frames_of(store, i, labels.moments[i]))}, names)
+    frames = {i: those for i in range(len(store)) if (
+        those := marks.episodes.get(i) or frames_of(store, i, labels.moments[i]))}
+    write_marks(out / 'labels.marks.json', store, options.recordings, frames, names)
     write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
     parts = segment_names(names)
     for source, name in distinct_names(store).items():
@@ -101,23 +122,44 @@ def run(options: Options) -> None:
             for event in events_of(store, i, labels, parts)))
     print(worth([(films[i], marked[i]) for i in marked], labels))
     if options.write_lerobot:
-        count = write_subtasks(options.write_lerobot, parts, {
-            i: Ends(moments.tolist(), float(store.seconds(i)[-1]))
-            for i, moments in enumerate(labels.moments)})
-        print(f'{options.write_lerobot}: {count} rows with the subtasks {listing(parts)}')
+        numbers = numbers_of(store, indices)
+        count, missing = write_subtasks(options.write_lerobot, parts, {
+            numbers[i]: Ends(labels.moments[i].tolist(), float(store.seconds(i)[-1]),
+                             float(np.diff(store.seconds(i)).max())) for i in frames})
+        print(f'{options.write_lerobot}: {count} rows with the subtasks {listing(parts)}' + (
+            f'; {missing} demonstrations without labels are {UNLABELLED}' if missing else ''))
+        if (version := str(known.get('codebase_version'))).startswith('v2'):
+            print(f'{options.write_lerobot}: is of {escaped(version, 20)}, and lerobot shows the '
+                  'subtasks of v3.0; convert it, then write them again: the conversion leaves '
+                  'their names out')
     print(f'{out}: {len(store)} demonstrations labelled; look at labels.png: numbers cannot tell '
           'whether all marks are early or late')
 
 
-def describe_all(recordings: Paths, image_topics: Sequence[str],
+def describe_all(recordings: Paths, reading: Reading,
                  signals: Sequence[str]) -> tuple[EpisodeStore, list[Film | None]]:
     """Return the demonstrations as the first camera saw them, and what is known of each."""
     bags = find_bags(recordings)
-    store, *beside = (open_recordings(bags, reading=Reading(
-        image_topic=topic, crop='whole', size=SIZE)) for topic in image_topics or ('',))
+    store, *beside = (open_recordings(bags, reading=replace(reading, image_topic=topic))
+                      for topic in reading.cameras)
     names = signals_like(store, signals)
     return store, [film_together(store, i, beside, names) for i in Progress(
         range(len(store)), desc='describing', unit='demonstration', delay=1)]
+
+
+def numbers_of(store: EpisodeStore, indices: Mapping[int, int]) -> list[int]:
+    """
+    Return the index in a LeRobot data set of each demonstration.
+
+    It is known by the seed, as some may have been lost at import; where these repeat, as in
+    recordings that were exported rather than imported, by the order.
+
+    :param indices: by seed, see describe_set.
+    """
+    seeds = [episode.seed for episode in store]
+    if len({*seeds}) < len(seeds):
+        return list(range(len(seeds)))
+    return [indices.get(seed, seed) for seed in seeds]
 
 
 def frames_of(store: EpisodeStore, i: int, moments: np.ndarray) -> Sequence[Mark]:

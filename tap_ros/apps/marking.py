@@ -41,6 +41,10 @@ class Marking:
         if path.exists():
             known = read_marks(path, store)
             self._marks, self.names = dict(known.episodes), self.names or known.names
+            if known.names and self.names != known.names:
+                raise ConfigError(f'names: {listing(names)}, but the marks in {path} are '
+                                  f'{listing(known.names)}; leave --names out, or choose another '
+                                  'file by --marks')
         other = [i for i, those in self._marks.items() if len(those) != len(self.names)]
         if names and other:
             raise ConfigError(f'names: {listing(names)}, but demonstration {other[0]} has '
@@ -61,9 +65,9 @@ class Marking:
             others than one for each name, in order.
         :raises StorageError: when the file cannot be written; the marks are then what they were.
         """
-        known = isinstance(episode, int) and episode in self.usable and isinstance(frames, list)
-        if not known or not all(isinstance(t, int) and 0 < t < self.store.lengths[episode] - 1
-                                for t in frames):
+        known = type(episode) is int and episode in self.usable and isinstance(frames, list)
+        if not known or not all(type(t) is int and 0 < t < self.store.lengths[episode] - 1
+                                for t in frames):  # True is an int, too
             raise ConfigError('expected an episode and frames between its start and its goal')
         rising = sorted(set(frames))
         if frames and self.names and (frames != rising or len(frames) != len(self.names)):
@@ -112,10 +116,9 @@ class Marking:
         count = len(next(iter(marks.values())))
         height, width = self.store.camera_size or (1, 1)
         crop = [] if '--crop' in options or height == width else ['--crop', 'centre']
-        # Recursion has a mark for each level, and no keyframes.
-        how = ['--recursion', str(count)] if count > 1 else ['--keyframes', '--no-new-pixels']
+        how = ['--recursion', str(count)] * (count > 1) + ['--keyframes', '--no-new-pixels']
         return [shlex.join(['python', '-m', 'tap_ros', *words]) for words in (
-            ['label', *both, *_only(options, '--image-topic'), '--out', f'labels/{name}'],
+            ['label', *both, *_without(options, '--crop'), '--out', f'labels/{name}'],
             ['train', 'predictor', *both, *options, *crop, '--size', '64', *how,
              '--test-fraction', '0.25', '--threads', '1', '--out', f'runs/{name}'])]
 
@@ -143,6 +146,6 @@ def spread(left: Iterable[int], marked: Collection[int]) -> list[int]:
     return found + rest
 
 
-def _only(options: Sequence[str], name: str) -> list[str]:
-    """Return the options of a name, of names and values."""
-    return [word for pair in zip(options[::2], options[1::2]) if pair[0] == name for word in pair]
+def _without(options: Sequence[str], name: str) -> list[str]:
+    """Return all options but those of a name, of names and values."""
+    return [word for pair in zip(options[::2], options[1::2]) if pair[0] != name for word in pair]

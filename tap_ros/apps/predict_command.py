@@ -10,11 +10,12 @@ from typing import Annotated, TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from tap_ros.base.contract import object_names
 from tap_ros.base.errors import ConfigError, ImageError, RecordingError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
 from tap_ros.base.text import escaped
-from tap_ros.images.crop import Crop
+from tap_ros.images.crop import Crop, WHOLE
 from tap_ros.images.drawing import grid, OBJECT_COLOURS, overlay, png_bytes
 from tap_ros.images.encodings import decompress
 from tap_ros.images.pixels import in_picture, resize_image, resize_pixels
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 PANEL, HEAD = 260, 26  # px, least side of a picture, and above it for its title
 LARGEST_PANEL = 480  # px; larger pictures are made smaller for the sheet
 _LARGEST = 2 ** 29  # bytes of rgb, of a picture file; phones make larger ones than cameras stream
-FAINT = 0.5  # mass of a map, below which an object is hardly in the prediction
+FAINT = 0.5  # share of an object that is in the prediction, below which it is hardly there
 
 _Pixels = conf.arg(metavar='U,V [U,V ...]', help_behavior_hint='(default: none)')
 
@@ -45,8 +46,9 @@ class Options:
     :param objects: where the objects are in the start picture: column and row of each, in the
         pixels of the file.
     :param goal_objects: where the same objects are in the goal picture, in the same order.
-    :param crop: the square part of the pictures that is used: 'centre', the largest one in the
-        middle, or LEFT,TOP,SIDE in pixels of the file; by default as the weights were trained.
+    :param crop: the part of the pictures that is used: 'centre', the largest square in the middle;
+        LEFT,TOP,SIDE, a square in pixels of the file; 'whole', all of it, squeezed into the shape
+        that the weights take; by default as the weights were trained.
     :param samples: how many to draw of weights with z.
     :param recursion: subgoals in a row.
     :param seed: of z; the same one draws the same samples.
@@ -94,19 +96,20 @@ def run(args: Options) -> None:
         if not args.crop and (why := predictor.camera_crop.unlike(picture.shape[:2], name)):
             print(f'warning: {why}', file=sys.stderr)
         windows[name] = Crop(cut.part).window(picture.shape[:2])
-        parts[name], places[name] = fit(picture, windows[name], pixels[name], predictor, name)
+        parts[name], places[name] = fit(
+            picture, windows[name], pixels[name], predictor, name, cut.part == WHOLE)
     subgoals = predictor.predict(
         parts['start'], parts.get('goal'), places['start'], places.get('goal'),
         num_samples=args.samples, recursion_depth=args.recursion, seed=args.seed)
     for warning in {subgoal.warning: None for subgoal in subgoals if subgoal.warning}:
         print(f'warning: {warning}', file=sys.stderr)
-    left, top, *extent = windows['start']
+    (left, top, *extent), names = windows['start'], object_names(len(places['start']))
     for subgoal in subgoals:
         print(f'{_title(subgoal, len(subgoals))}{":" if len(places["start"]) else ""}')
-        for k, (where, mass) in enumerate(zip(subgoal.expected_pixels, subgoal.mass), start=1):
+        for name, where, mass in zip(names, subgoal.expected_pixels, subgoal.mass):
             u, v = (where + 0.5) * extent / subgoal.image.shape[1::-1] - 0.5 + (left, top)
-            faint = ', hardly in the picture' if mass < FAINT else ''
-            print(f'  object {k} at {u:.1f},{v:.1f} (mass {mass:.2f}{faint})')
+            faint = f', but hardly in the picture: {mass:.0%} of it' if mass < FAINT else ''
+            print(f'  {name} at {u:.1f},{v:.1f}{faint}')
     write_atomically(args.out, labelled(parts, places, subgoals))
     print(f'written: {escaped(args.out)}')
 
@@ -159,23 +162,24 @@ def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
 
 
 def fit(picture: np.ndarray, window: Sequence[int], pixels: np.ndarray, predictor: 'Predictor',
-        name: str) -> tuple[np.ndarray, np.ndarray]:
+        name: str, squeezed: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """
     Cut a picture, and positions in it, to what the weights take; scale them where they need it.
 
     :param picture: uint8 (H, W, 3).
-    :param window: left, top, width and height of the part, of a shape that the weights take.
+    :param window: left, top, width and height of the part.
     :param pixels: (K, 2), (u, v) in the picture.
     :param name: how errors call it.
+    :param squeezed: take a part of any shape.
     :return: uint8 (height, width, 3) and float32 (K, 2).
     :raises ImageError: for another shape, or a position outside.
     """
     (left, top, W, H), size = window, predictor.image_size
     full = predictor.camera_crop.is_cut((H, W))
-    if not full and W * size[0] != H * size[1]:
+    if not full and not squeezed and W * size[0] != H * size[1]:
         raise ImageError(f'{name}: {W}x{H} pixels (width x height); the weights take pictures of '
                          f'the shape {size[1]}x{size[0]}; say which part of it is used, by --crop '
-                         'centre or --crop LEFT,TOP,SIDE')
+                         'centre or --crop LEFT,TOP,SIDE, or squeeze all of it, by --crop whole')
     inside = pixels - np.array([left, top], np.float32)
     if not in_picture(inside, (H, W)).all():
         raise ImageError(
@@ -226,7 +230,7 @@ def _panel(title: str, picture: np.ndarray, marks: np.ndarray, side: int) -> np.
             colour = OBJECT_COLOURS[k % len(OBJECT_COLOURS)]
             draw.line((u - 12, v + 12, u, v), colour, 2)
             draw.ellipse((u - 9, v - 9, u + 9, v + 9), colour, 'white')
-            draw.text((u, v), str(k + 1), 'white', ImageFont.load_default(14), anchor='mm')
+            draw.text((u, v), str(k), 'white', ImageFont.load_default(14), anchor='mm')
     return np.array(image)
 
 

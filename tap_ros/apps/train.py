@@ -54,7 +54,8 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
                               f'{meant(name, known)}see training/{model}_config.py')
     settings |= {'recordings': recordings, **({'out': out} if out else {})}
     for name, value in settings.items():
-        if name in ('recordings', 'held_out', 'image_topic'):
+        if name in (
+                'recordings', 'held_out', 'image_topic', 'label_topic', 'label_signals'):
             several = [value] if isinstance(value, str | Path) else value
             settings[name] = tuple(str(each) for each in several if str(each))
         elif isinstance(value, Path):

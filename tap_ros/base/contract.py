@@ -3,7 +3,7 @@
 """
 The contract between simulator, recordings, planner and nodes: what they share stands here, once.
 
-Constants and a function of them. Nothing is imported, so that setup.py can read this file, too.
+Constants and functions of them. Nothing is imported, so that setup.py can read this file, too.
 """
 
 # Motion: an action is (dx, dy, dz, opening).
@@ -62,10 +62,15 @@ NODE_CLASSES = {
     'tracker_node': 'tap_ros.nodes.tracker.node:TrackerNode',
     'explorer_node': 'tap_ros.apps.explorer.node:ExplorerNode',
 }
+STATES = SEEN, HIDDEN, UNSURE, LOST = 'seen', 'hidden', 'unsure', 'lost'  # of ObjectStates
 OWNED = 'TAP_ROS_OWNED'  # environment variable of a node that ends when its standard input closes
 
 
 def step_budget(num_objects: int) -> int:
     """Return B of App. F, how many commands a goal may take, by the number of its objects."""
     return 40 if num_objects <= 2 else 75
-STATES = SEEN, HIDDEN, UNSURE, LOST = 'seen', 'hidden', 'unsure', 'lost'  # of ObjectStates
+
+
+def object_names(count: int) -> tuple[str, ...]:
+    """Return what objects are called that nobody has named, in their order: object_0, object_1."""
+    return tuple(f'object_{k}' for k in range(count))

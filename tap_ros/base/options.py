@@ -12,6 +12,8 @@ from dataclasses import replace
 from types import GenericAlias
 from typing import Annotated, Any, cast, get_args
 
+from tap_ros.base.errors import ConfigError
+from tap_ros.base.text import listing
 import tyro
 from tyro import conf
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -50,6 +52,12 @@ def parse(kind: Any, words: Sequence[str], prog: str = 'python -m tap_ros',
     """
     return tyro.cli(kind, args=words, prog=prog, description=description, config=_STYLE,
                     registry=_RULES, default=tyro.MISSING_NONPROP if default is None else default)
+
+
+def check_different(option: str, values: Sequence[str]) -> None:
+    """Raise ConfigError for a value of an option that is given twice."""
+    if twice := sorted({value for value in values if values.count(value) > 1}):
+        raise ConfigError(f'{option}: {listing(twice)} is given twice; give it once')
 
 
 def one_of(choices: Iterable[str]) -> PrimitiveConstructorSpec[str]:

@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 from tap_ros.planning.cost import distances_to_pixels
+from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps, WarpedMaps
 from tap_ros.recording.episode import Episode
@@ -66,18 +67,23 @@ def context_pixels(episode: Episode, goal_picture: str) -> np.ndarray:
     return np.stack([episode.object_pixels[0], goal]).astype(np.float32)
 
 
-def predicted_maps(pixels: np.ndarray, prediction: Prediction, b: int) -> WarpedMaps:
+def predicted_maps(pixels: np.ndarray, prediction: Prediction, b: int,
+                   bank: KeyframeBank | None = None, alike: int = 0) -> WarpedMaps:
     """
     Warp one-hot maps of the objects as a prediction warps its context pictures.
 
     :param pixels: float32 (2, K, 2), of context_pixels; a forward prediction uses the start only.
     :param prediction: networks.Prediction of a batch.
     :param b: which one of the batch.
+    :param bank: that the third picture is from, of demonstration `alike`; None: there is none.
     :return: warp.WarpedMaps of (K, H, W) maps, each sums to 1, and (K,) masses.
     """
     flow, masks = prediction.flow[b:b + 1], prediction.masks[b:b + 1]
-    pixels = torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device)
-    warped = warp_object_maps(one_hot_maps(pixels, flow.shape[-2:])[None], flow, masks)
+    maps = one_hot_maps(
+        torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device), flow.shape[-2:])[None]
+    if bank is not None:
+        maps = bank.beside_maps(maps, pixels[:1], np.array([alike]))
+    warped = warp_object_maps(maps, flow, masks)
     return WarpedMaps(warped.maps[0], warped.mass[0])
 
 

@@ -198,7 +198,11 @@ def ask(network: PredictorNetwork | Predictor, batch: Batch,
     if size:
         z = draw_latents(episodes, 1, size)[:, 0].to(device)
     prediction = network(to_float(batch.context).to(device), z)
-    return prediction.image, lambda b, pixels: predicted_maps(pixels, prediction, b)
+    if (bank := getattr(network, 'bank', None)) is None:
+        return prediction.image, lambda b, pixels: predicted_maps(pixels, prediction, b)
+    alike, _ = bank.find(batch.context.cpu().numpy())
+    return prediction.image, lambda b, pixels: predicted_maps(
+        pixels, prediction, b, bank, int(alike[b]))
 
 
 def draw_latents(episodes: Iterable[int], count: int, size: int) -> torch.Tensor:
@@ -241,22 +245,24 @@ def _changed_l1(images: torch.Tensor, batch: Batch, match: torch.Tensor,
     return error / changed.sum((1, 2, 3))  # 0 / 0 is NaN
 
 
-def verdict(held_out: EpisodeScores, training: EpisodeScores | None) -> list[str]:
+def verdict(scored: EpisodeScores, training: EpisodeScores | None,
+            name: str = 'held-out episodes') -> list[str]:
     """
     Compare predictions with copying the nearer input, both at the matched frame, in words.
 
     A low error alone says nothing: frames beside an input are predicted well by copying it.
 
-    :param held_out: scores of episodes that were not trained on; training: of some that were.
+    :param scored: scores of episodes, by default not trained on; training: of some that were.
+    :param name: of those that are scored.
     :return: lines.
     """
     lines, words = [], []
-    for name, scores in (('held-out episodes', held_out), ('training episodes', training)):
+    for title, scores in ((name, scored), ('training episodes', training)):
         if scores is None:
             continue
         word, ratio = against_copying(scores.min_l1, scores.copying)
         words.append(word)
-        lines.append(f'{name}, at the matched frame: {word}; error '
+        lines.append(f'{title}, at the matched frame: {word}; error '
                      f'{scores.min_l1.mean():.4f}, copying {scores.copying.mean():.4f}: '
                      f'{ratio.value:.2f} times ({ratio.low:.2f}, {ratio.high:.2f})')
     if words[0] in ('worse than copying', 'not told from copying') and words[1:] == [

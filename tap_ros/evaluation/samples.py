@@ -73,7 +73,11 @@ def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: It
             if prediction.new_pixels is None and pixels.size and np.isfinite(pixels).all():
                 flow, masks = prediction.flow, prediction.masks
                 maps = one_hot_maps(torch.from_numpy(pixels[:flow.shape[1]]).to(device),
-                                    flow.shape[-2:]).expand(count, -1, -1, -1, -1)
+                                    flow.shape[-2:])[None]
+                if network.bank is not None:
+                    alike, _ = network.bank.find(batch.context.cpu().numpy())
+                    maps = network.bank.beside_maps(maps, pixels[:1], alike)
+                maps = maps.expand(count, -1, -1, -1, -1)
                 at = expected_pixels(warp_object_maps(maps, flow, masks).maps)  # samples, K, 2
                 placed = ((at - at.mean(0)) ** 2).sum(-1).mean(0).sqrt().mean().item()
         errors = errors.amin(0, keepdim=True)  # the best sample for each target

@@ -43,8 +43,8 @@ class Crop:
             numbers = re.fullmatch(r'(\d{1,5}),(\d{1,5}),([1-9]\d{0,4})', self.part)
             if numbers is None:
                 raise ConfigError(
-                    f'crop: expected {CENTRE}, or LEFT,TOP,SIDE of a square in pixels of the '
-                    f'camera, such as 80,0,480; got {escaped(repr(self.part), 40)}')
+                    f'crop: expected {CENTRE}, {WHOLE}, or LEFT,TOP,SIDE of a square in pixels of '
+                    f'the camera, such as 80,0,480; got {escaped(repr(self.part), 40)}')
         if not 0 <= self.size <= MAX_SIZE:
             raise ConfigError(f'size: expected 0 to {MAX_SIZE} pixels a side, got {self.size}')
 
@@ -73,7 +73,7 @@ class Crop:
         if self.size and height != width and self.part != WHOLE:
             raise ImageError(
                 f'pictures of {width}x{height} pixels (width x height) are not square; training '
-                f'says which square of them is used, by --crop {CENTRE} or --crop LEFT,TOP,SIDE')
+                f'says which part of them is used, by --crop {CENTRE}, {WHOLE} or LEFT,TOP,SIDE')
         return 0, 0, width, height
 
     def cut_size(self, size: Sequence[int]) -> tuple[int, int]:

@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+import math
 import sys
 from typing import Any
 
@@ -192,7 +193,7 @@ def _fields(values: np.ndarray, encoding: str, stamp: Stamp | int,
     return {
         'header': header_fields(stamp, frame_id), 'height': height, 'width': width,
         'encoding': encoding, 'is_bigendian': int(sys.byteorder == 'big'),
-        'step': int(np.prod(values.shape[1:])) * values.itemsize,
+        'step': math.prod(values.shape[1:]) * values.itemsize,
         'data': values.reshape(-1).view(np.uint8)}
 
 

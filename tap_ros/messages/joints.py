@@ -8,7 +8,7 @@ and after it (`between`); a state that is farther away than a limit says nothing
 """
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 import threading
@@ -19,7 +19,7 @@ from tap_ros.base.contract import GRIPPER_JOINTS
 from tap_ros.base.errors import KinematicsError, PlanningError
 from tap_ros.base.text import listing
 from tap_ros.messages.stamps import header_fields, MAX_GAP, PROOF, Stamp, to_nanoseconds
-from tap_ros.robots.arm import Arm
+from tap_ros.robots.arm import Arm, Mount
 
 PLACE, OPENING = GRIPPER_JOINTS[:3], GRIPPER_JOINTS[3]
 KEPT_NS = 5 * 10**9  # what is older than the newest state by more is forgotten
@@ -247,13 +247,17 @@ class GripperHistory:
     States may tell its place, as the simulator's do; else it follows from the arm's joints. An
     opening that is not told together with the place is that of the newest states that tell it.
 
-    :param arm: Arm, with the Mount where it stands.
+    :param arm: Arm.
     :param prefix: of the names of its joints.
     :param opening: of the gripper where no states of an arm's driver tell it, 0 to 1.
+    :param mount: returns the Mount where it stands, or raises KinematicsError; by default that of
+        the Arm.
     """
 
-    def __init__(self, arm: Arm, prefix: str, opening: float) -> None:
+    def __init__(self, arm: Arm, prefix: str, opening: float,
+                 mount: Callable[[], Mount] | None = None) -> None:
         self._kind, self._fixed_opening = arm, opening
+        self._mount = mount or (lambda: arm.mount)
         self._told, self._beside = JointHistory(PLACE), JointHistory([OPENING])
         self._openings = JointHistory([OPENING])  # of whatever states
         self._arm = JointHistory([prefix + name for name in arm.joints])
@@ -295,7 +299,7 @@ class GripperHistory:
         Return the gripper's state at the time of a picture, and when it was received.
 
         :return: float32 (4,) x, y, z in m and opening from 0 to 1, and a monotonic time.
-        :raises KinematicsError: when the joints are not known for that time.
+        :raises KinematicsError: when the joints are not known for that time, or where it stands.
         """
         source = self._source
         found = source.at(stamp_ns, max_gap_s)
@@ -304,7 +308,7 @@ class GripperHistory:
             if opening is None or not self._beside.missing():
                 opening, = self._beside.at(stamp_ns, max_gap_s).positions
         else:
-            place = self._kind.gripper_at(found.positions)
+            place = self._kind.gripper_at(found.positions, self._mount())
             opening = self._openings.newest(OPENING, stamp_ns)
         opening = self._fixed_opening if opening is None else opening
         return np.array([*place, opening], np.float32), found.received

@@ -63,6 +63,8 @@ class ReachConfig:
     :param timeout: s without a command, planning apart, after which the goal ends.
     :param rounds: how often to ask where to go, at least 1: again when the subgoals of a round are
         passed and a command was sent since it began, and not after the last round.
+    :param passed: px, as reached, of subgoals: objects that are pushed slide on, and where they
+        come to rest the next leg begins. 0: as `reached`.
     """
 
     step_budget: int = 0
@@ -72,6 +74,7 @@ class ReachConfig:
     max_age: float = float('inf')
     timeout: float = float('inf')
     rounds: int = 1
+    passed: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ class Wait:
 
 @dataclass(frozen=True)
 class End:
-    """The goal has ended: 'reached', 'spent' (the step budget) or 'aborted'."""
+    """The goal has ended: 'reached', 'spent' (the step budget) or 'aborted'; and that in words."""
 
     outcome: str
     message: str
@@ -255,7 +258,8 @@ class Reach:
         config, passed = self._config, self._next
         self._budget = config.step_budget or step_budget(len(targets[-1].pixels))
         state = _State(Memory(self._seed), Itinerary(
-            targets, self._budget - self.steps, config.switch, config.reached))
+            targets, self._budget - self.steps, config.switch,
+            config.passed or config.reached))
         if passed is not None and self._state is not None:
             met = self._state.memory
             state = replace(
@@ -309,10 +313,9 @@ class Reach:
         self.pixels = pixels = seen.pixels
         self.distance = itinerary.targets[-1].distance(pixels)
         if self.distance <= config.reached:
-            return End('reached', f'{self.distance:.1f} px from the goal, reached')
+            return End('reached', 'reached')
         if self.steps >= self._budget:
-            return End('spent', f'{self.distance:.1f} px from the goal, '
-                                f'step budget of {self._budget} spent')
+            return End('spent', f'stopped, as the step budget of {self._budget} is spent')
         # what to go to
         before = len(state.switches) - len(state.earlier)
         stage = itinerary.stage(self.steps - state.first_step, pixels, before)

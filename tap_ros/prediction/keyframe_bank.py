@@ -4,8 +4,10 @@
 A bank of keyframes: what demonstrations showed at the bottleneck, to be copied from.
 
 A network for three pictures is given start, goal, and the keyframe of the demonstration whose
-start and goal are most alike, as no hand at the object is in the first two; not in the paper. The
-bank is part of the weights file: small pictures of start and goal, and the keyframe as a PNG.
+start and goal are most alike, as no hand at the object is in the first two; not in the paper. With
+recursion each level has a keyframe of its own. The bank is part of the weights file: of each
+demonstration small pictures of start and goal, keyframes as PNGs, and where its objects are in
+them, where the recordings tell.
 """
 
 from collections.abc import Callable
@@ -21,17 +23,22 @@ from tap_ros.images.pixels import resize_image, to_float, to_uint8
 from tap_ros.prediction.retrieval import (
     ends_of,
     nearest_others,
+    places_then,
     SIDE,
     spread_out,
     unlike,
     usual_distance,
 )
+from tap_ros.prediction.warp import one_hot_maps
 import torch
 
-MOST = 64  # keyframes
+MOST = 64  # demonstrations
+MOST_LEVELS = 8  # keyframes of each
+MOST_OBJECTS = 32  # whose places are kept
+NOWHERE = -1e6  # px; in a file: unknown
 MOST_BYTES = 2**28  # of all of them together, as rgb
 _PREFIX = 'bank.'
-_ENDS, _KEYFRAME = f'{_PREFIX}ends', f'{_PREFIX}keyframe.'
+_ENDS, _KEYFRAME, _OBJECTS = f'{_PREFIX}ends', f'{_PREFIX}keyframe.', f'{_PREFIX}objects'
 
 
 class KeyframeBank:
@@ -39,18 +46,30 @@ class KeyframeBank:
     Keyframes of demonstrations, and which of them goes with a start and a goal; never changed.
 
     :param ends: uint8 (N, 2, SIDE, SIDE, 3), start and goal of each, see retrieval.ends_of.
-    :param files: N pictures of one size, as PNG.
-    :raises ConfigError: for none, more than MOST, or as many of one as not of the other.
+    :param files: N * L pictures of one size, as PNG: of each demonstration one for each level of
+        recursion.
+    :param objects: float32 (N, 1 + L, K, 2), (u, v) of objects in the start and the keyframes, in
+        pixels of the network; NaN where unknown. None: nothing is known.
+    :raises ConfigError: for none, too many, or as many of one as not of the others.
     :raises ImageError: for pictures that are damaged, too large together, or differ in size.
-    :ivar keyframes: N pictures uint8 (H, W, 3), at the recorded size.
+    :ivar keyframes: N * L pictures uint8 (H, W, 3), at the recorded size.
+    :ivar levels: L.
     """
 
-    def __init__(self, ends: np.ndarray, files: list[bytes]) -> None:
-        if ends.dtype != np.uint8 or ends.shape != (len(files), 2, SIDE, SIDE, 3) or not (
-                1 <= len(files) <= MOST):
+    def __init__(self, ends: np.ndarray, files: list[bytes],
+                 objects: np.ndarray | None = None) -> None:
+        N, self.levels = len(ends), len(files) // max(1, len(ends))
+        if ends.dtype != np.uint8 or ends.shape != (N, 2, SIDE, SIDE, 3) or not (
+                1 <= N <= MOST and 1 <= self.levels <= MOST_LEVELS
+                and len(files) == N * self.levels):
             raise ConfigError(f'expected 1 to {MOST} of them, and of each a start and a goal of '
                               f'{SIDE}x{SIDE} pixels')
-        self._ends, self._files = ends, files
+        if objects is not None and (
+                objects.dtype != np.float32 or objects.ndim != 4 or objects.shape[3] != 2
+                or objects.shape[:2] != (N, 1 + self.levels)
+                or objects.shape[2] > MOST_OBJECTS):
+            raise ConfigError(f'expected places of at most {MOST_OBJECTS} objects in each')
+        self._ends, self._files, self._objects = ends, files, objects
         self.keyframes = [decompress(file, 'png', MOST_BYTES // len(files)) for file in files]
         if len({picture.shape for picture in self.keyframes}) > 1:
             raise ImageError('they differ in size')
@@ -58,26 +77,31 @@ class KeyframeBank:
         self._scaled: dict[tuple[int, ...], np.ndarray] = {}
 
     def __len__(self) -> int:
-        """Return the number of keyframes."""
-        return len(self._files)
+        """Return the number of demonstrations."""
+        return len(self._ends)
 
     def __deepcopy__(self, memo: object) -> Self:
         """Return itself: copies of a network share it."""
         return self
 
     @classmethod
-    def choose(cls, ends: np.ndarray, keyframe: Callable[[int], np.ndarray]) -> Self:
+    def choose(cls, ends: np.ndarray, keyframe: Callable[[int], np.ndarray],
+               objects: np.ndarray | None = None, levels: int = 1) -> Self:
         """
         Make a bank of the keyframes that cover all demonstrations best, as many as it may have.
 
         :param ends: uint8 (N, 2, SIDE, SIDE, 3) of all demonstrations, see retrieval.ends_of; of
             their start and goal pictures as the network is given them.
-        :param keyframe: returns that of a demonstration, uint8 (H, W, 3); called for the chosen.
+        :param keyframe: returns that of a number, uint8 (H, W, 3): of demonstration i the numbers
+            i * levels and following; called for the chosen.
+        :param objects: see KeyframeBank, of all demonstrations.
         :raises ImageError: see KeyframeBank.
         """
-        most = max(1, min(MOST, MOST_BYTES // keyframe(0).nbytes))
+        most = max(1, min(MOST, MOST_BYTES // (levels * keyframe(0).nbytes)))
         chosen = spread_out(ends, most)
-        return cls(ends[chosen], [png_bytes(keyframe(i)) for i in chosen.tolist()])
+        return cls(ends[chosen], [png_bytes(keyframe(i * levels + level))
+                                  for i in chosen.tolist() for level in range(levels)],
+                   None if objects is None else objects[chosen])
 
     @classmethod
     def take(cls, tensors: dict[str, torch.Tensor], path: str | Path) -> Self | None:
@@ -92,23 +116,27 @@ class KeyframeBank:
         if not own:
             return None
         try:
-            ends = own.pop(_ENDS).numpy()
+            ends, objects = own.pop(_ENDS).numpy(), own.pop(_OBJECTS, None)
             files = [own.pop(f'{_KEYFRAME}{n}') for n in range(len(own))]
             if any(file.dtype != torch.uint8 or file.dim() != 1 for file in files):
                 raise ConfigError('expected each as the bytes of a file')
-            return cls(ends, [file.numpy().tobytes() for file in files])
+            return cls(ends, [file.numpy().tobytes() for file in files],
+                       None if objects is None else objects.where(
+                           objects > NOWHERE, torch.nan).numpy())
         except (LookupError, TypeError, ConfigError, ImageError) as error:
             raise WeightsError(f'{escaped(path)}: its keyframes cannot be used: '
                                f'{escaped(error)}; copy it again, or train again') from error
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return what a weights file holds of it, by name."""
-        return {_ENDS: torch.from_numpy(self._ends), **{
+        known = {} if self._objects is None else {
+            _OBJECTS: torch.from_numpy(self._objects).nan_to_num(NOWHERE)}
+        return {_ENDS: torch.from_numpy(self._ends), **known, **{
             f'{_KEYFRAME}{n}': torch.frombuffer(bytearray(file), dtype=torch.uint8)
             for n, file in enumerate(self._files)}}
 
     def scaled(self, size: tuple[int, ...]) -> np.ndarray:
-        """Return the keyframes as a network sees them, uint8 (N, H, W, 3); size is (H, W)."""
+        """Return the keyframes as a network sees them, uint8 (N * L, H, W, 3); size is (H, W)."""
         if size not in self._scaled:
             self._scaled[size] = np.stack([
                 picture if picture.shape[:2] == size else resize_image(picture, size)
@@ -117,7 +145,7 @@ class KeyframeBank:
 
     def find(self, pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Find the keyframes of the most alike demonstrations, see retrieval.nearest_others.
+        Find the most alike demonstrations, see retrieval.nearest_others.
 
         :param pictures: uint8 (B, 2, H, W, 3), start and goal as the network is given them.
         :return: indices int64 (B,), and distances (B,), see retrieval.
@@ -134,7 +162,30 @@ class KeyframeBank:
         """Return contexts (B, 2, 3, H, W) in [-1, 1] with the keyframe as the third picture."""
         return self.beside(context, self.find(to_uint8(context))[0])
 
-    def beside(self, context: torch.Tensor, indices: np.ndarray) -> torch.Tensor:
-        """Return contexts (B, 2, 3, H, W) with the keyframes of indices (B,) as third pictures."""
-        keyframes = self.scaled(tuple(context.shape[-2:]))[indices]
+    def numbers(self, indices: np.ndarray, level: int = 1) -> np.ndarray:
+        """Return which keyframes demonstrations (B,) have at a level, from 1; or at the last."""
+        return indices * self.levels + min(level, self.levels) - 1
+
+    def beside(self, context: torch.Tensor, indices: np.ndarray, level: int = 1) -> torch.Tensor:
+        """Return contexts (B, 2, 3, H, W) with keyframes of demonstrations (B,) as thirds."""
+        keyframes = self.scaled(tuple(context.shape[-2:]))[self.numbers(indices, level)]
         return torch.cat([context, to_float(keyframes).to(context.device)[:, None]], 1)
+
+    def beside_maps(self, maps: torch.Tensor, asked: np.ndarray, indices: np.ndarray,
+                    level: int = 1) -> torch.Tensor:
+        """
+        Add where objects are in the keyframes; those of which nothing is known are nowhere.
+
+        :param maps: (B, 2, K, H, W), in start and goal.
+        :param asked: (B, K, 2), (u, v) in the start; see retrieval.places_then.
+        :param indices: demonstrations (B,).
+        :return: (B, 3, K, H, W); the same as given where nothing is known.
+        """
+        if self._objects is None:
+            return maps
+        places = torch.from_numpy(np.stack([
+            places_then(known[0], known[min(level, self.levels)], pixels)
+            for pixels, known in zip(asked, self._objects[indices])]))
+        third = one_hot_maps(places.nan_to_num(), maps.shape[-2:])
+        third *= places.isfinite().all(-1)[..., None, None]
+        return torch.cat([maps, third.to(maps.device)[:, None]], 1)

@@ -56,10 +56,12 @@ def l1_errors(images: torch.Tensor, targets: torch.Tensor,
         B, T = frames.shape[:2]
         ends = [(0, T)] * B if wanted is None else map(_ends, wanted)
         distances = images.new_full((B, images.shape[1], T), math.inf)
+        episodes, differences = images.new_empty(2, T, frames.shape[2])  # memory that is warm
         for b, (first, last) in enumerate(ends):
-            episode = frames[b, first:last].float()
+            episode = episodes[:last - first].copy_(frames[b, first:last])
             for q, query in enumerate(images[b]):
-                distances[b, q, first:last] = (episode - query).abs_().mean(1)
+                out = differences[:last - first] if q + 1 < len(images[b]) else episode
+                distances[b, q, first:last] = torch.sub(episode, query, out=out).abs_().mean(1)
     if wanted is not None:
         distances.masked_fill_(~wanted[:, None], math.inf)
     return distances / 255

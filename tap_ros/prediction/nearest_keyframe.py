@@ -8,14 +8,22 @@ from typing import Any, Self
 
 import numpy as np
 from tap_ros.base.errors import ConfigError
+from tap_ros.base.text import escaped
 from tap_ros.images.crop import trained_crop
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.protocol import check_request, Predictor, Request
-from tap_ros.prediction.retrieval import ends_of, nearest_others, unlike, usual_distance
+from tap_ros.prediction.retrieval import (
+    ends_of,
+    nearest_others,
+    places_then,
+    unlike,
+    usual_distance,
+)
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.marks import Mark, read_marks
+from tap_ros.recording.reading import AS_RECORDED, Reading
 import torch
 
 NEIGHBOURS = 5  # episodes whose keyframes are looked at
@@ -61,18 +69,28 @@ class NearestKeyframe(Predictor):
         """
         Read recordings, and marks of their episodes, such as `label` writes.
 
-        :param argument: paths, separated by ':' as in PATH; one that ends in .json is of marks.
+        :param argument: paths, separated by ':' as in PATH; one that ends in .json is of marks,
+            and one such as gap=2 no path, but a field of Reading.
         :param device: unused.
         :raises ConfigError: if no path is given, or marks cannot be used; RecordingError: if
             recordings cannot be read.
         """
-        paths = list(filter(None, argument.split(os.pathsep)))
+        parts = list(filter(None, argument.split(os.pathsep)))
+        told = {name: value for name, is_told, value in (part.partition('=') for part in parts)
+                if is_told and hasattr(AS_RECORDED, name)}
+        paths = [part for part in parts if part.partition('=')[0] not in told]
         files = [path for path in paths if path.endswith('.json')]
         if len(files) > 1 or len(files) == len(paths):
             raise ConfigError('nearest_keyframe: name its recordings, and at most one file of '
                               'marks, such as nearest_keyframe:bags/push2 or '
                               'nearest_keyframe:bags/door:labels/labels.marks.json')
-        store = open_recordings([path for path in paths if path not in files], progress=False)
+        try:
+            reading = Reading(**{name: type(getattr(AS_RECORDED, name))(value)
+                                 for name, value in told.items()})
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f'nearest_keyframe: {escaped(error)}; expected a number') from error
+        store = open_recordings([path for path in paths if path not in files], progress=False,
+                                reading=reading)
         return cls(store, read_marks(files[0], store).episodes if files else None)
 
     def predict_together(self, requests: Sequence[Request]) -> list[list[Subgoal]]:
@@ -140,11 +158,5 @@ def recorded_places(episode: Episode, t: int, start_pixels: np.ndarray) -> np.nd
     :param start_pixels: (K, 2), (u, v) in the start picture of the request.
     :return: float32 (K, 2).
     """
-    from scipy.optimize import linear_sum_assignment  # takes a moment to import
-    places = np.array(start_pixels, np.float32)
-    begun, then = episode.object_pixels[0], episode.object_pixels[t]
-    known = np.flatnonzero(np.isfinite(np.concatenate([begun, then], 1)).all(1))
-    away = np.linalg.norm(places[:, None] - begun[None, known], axis=-1)
-    for k, j in zip(*linear_sum_assignment(away)):
-        places[k] = then[known[j]]
-    return places
+    places = places_then(episode.object_pixels[0], episode.object_pixels[t], start_pixels)
+    return np.where(np.isfinite(places), places, np.asarray(start_pixels, np.float32))

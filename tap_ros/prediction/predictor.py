@@ -123,16 +123,13 @@ class SubgoalPredictor(Predictor):
         sources = [pictures_of(request) for N, request in zip(counts, requests) for _ in range(N)]
         sizes = [answer_size(pictures) for pictures in sources]
         said: list[dict[str, Any]] = [{} for _ in requests]
-        if (bank := self._network.bank) is not None:  # one keyframe for all levels of a request
-            numbers, distances = bank.find(np.stack([pictures for pictures, _ in scenes]))
+        if (bank := self._network.bank) is not None:  # one demonstration for all levels
+            alike, distances = bank.find(np.stack([pictures for pictures, _ in scenes]))
             said = [{'distance': distance, 'warning': bank.unlike(distance)}
                     for distance in distances.tolist()]
-            shown = np.repeat(numbers, counts)
-            context = bank.beside(context, shown)
-            sources = [[*pictures, bank.keyframes[i]] for pictures, i in zip(sources, shown)]
-        maps = _join([  # rows, C, K, H, W
-            one_hot_maps(torch.from_numpy(pixels).to(self._device), self.image_size).expand(
-                N, -1, -1, -1, -1) for N, (_, pixels) in zip(counts, scenes)])
+            alike = np.repeat(alike, counts)
+        places = np.repeat([pixels for _, pixels in scenes], counts, 0)  # rows, C, K, 2
+        maps = one_hot_maps(torch.from_numpy(places).to(self._device), self.image_size)
         levels: list[list[list[Subgoal]]] = [[] for _ in requests]
         for level in range(1, max(request.recursion_depth for request in requests) + 1):
             # Those that go on are the first rows, since the deepest come first.
@@ -143,19 +140,22 @@ class SubgoalPredictor(Predictor):
             if latent_size:
                 z = _join([torch.randn(N, latent_size, generator=generator) for N, generator in
                            zip(counts[:going], generators)]).to(self._device)
-            prediction = self._network(context, z)
-            warped = warp_object_maps(maps, prediction.flow, prediction.masks)
-            images = enlarged(prediction, sources[:rows], sizes)
+            shown, known, copied = context, maps, sources[:rows]
+            if bank is not None:
+                shown = bank.beside(context, alike[:rows], level)
+                known = bank.beside_maps(maps, places[:rows, 0], alike[:rows], level)
+                copied = [[*pictures, bank.keyframes[n]] for pictures, n in zip(
+                    copied, bank.numbers(alike, level))]
+            prediction = self._network(shown, z)
+            warped = warp_object_maps(known, prediction.flow, prediction.masks)
+            images = enlarged(prediction, copied, sizes)
             found = _to_subgoals(images, warped, counts[:going], level, said)
             for subgoals, chain in zip(found, levels):
                 chain.append(subgoals)
             # The prediction takes the place of the last picture that was sent.
-            at = maps.shape[1] - 1
-            context = torch.cat([context[:, :at], prediction.image.clamp(-1, 1)[:, None],
-                                 context[:, at + 1:]], 1)
+            context = torch.cat([context[:, :-1], prediction.image.clamp(-1, 1)[:, None]], 1)
             maps = torch.cat([maps[:, :-1], warped.maps[:, None]], 1)
-            sources = [[*pictures[:at], image, *pictures[at + 1:]]
-                       for pictures, image in zip(sources, images)]
+            sources = [[*pictures[:-1], image] for pictures, image in zip(sources, images)]
         if self.mode == 'bidirectional':
             for chain in levels:
                 chain.reverse()  # each level lies before the one that it was predicted from

@@ -112,6 +112,26 @@ def spread_out(ends: np.ndarray, count: int) -> np.ndarray:
     return np.sort(chosen)
 
 
+def places_then(begun: np.ndarray, then: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """
+    Say where objects are in a frame of a demonstration.
+
+    Each is taken for the object of the demonstration that began nearest to it.
+
+    :param begun: (J, 2), (u, v) of the objects in the start of the demonstration.
+    :param then: (J, 2), in the frame; NaN where unknown, as in begun.
+    :param asked: (K, 2), in the start picture that is asked about.
+    :return: float32 (K, 2); NaN for one without such an object, or whose place is unknown.
+    """
+    from scipy.optimize import linear_sum_assignment  # takes a moment to import
+    places = np.full(np.shape(asked), np.nan, np.float32)
+    known = np.flatnonzero(np.isfinite(np.concatenate([begun, then], 1)).all(1))
+    away = np.linalg.norm(np.asarray(asked)[:, None] - begun[None, known], axis=-1)
+    for k, j in zip(*linear_sum_assignment(away)):
+        places[k] = then[known[j]]
+    return places
+
+
 def unlike(distance: float, usual: float) -> str:
     """Say that a question is unlike all demonstrations; '': it is not."""
     return '' if distance <= usual else (

@@ -100,21 +100,24 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
 
     p = sum over c of mask_c * warp(map_c, flow_c), divided by its sum. A map that loses nearly
     all its mass (the flow jumps over the object's pixel) is blurred by one pixel before warping;
-    if that does not help, it is the mask-weighted mixture of the maps where they were, and
-    if the masks hide these too, their plain mean.
+    if that does not help, the object is where a keyframe has it, which is after start and goal;
+    else it is the mask-weighted mixture of the maps where they were, and if the masks hide these
+    too, their plain mean.
 
-    :param maps: (B, C, K, H, W), maps in each context picture, each summing to 1.
+    :param maps: (B, C, K, H, W), maps in each context picture, each summing to 1; those of start
+        and goal. In a keyframe of another demonstration also 0: nothing is known of the object.
     :param flow: (B, C or more, 2, H, W) in pixels.
     :param masks: (B, C or more, 1, H, W). What comes after the first C is left out: new pixels
-        have no origin, and in a keyframe of another demonstration the objects are not known. The
-        mass tells how much of an object is copied from there.
+        have no origin, and where objects are in a keyframe may not be known. The mass tells how
+        much of an object is copied from where it is known.
     :return: WarpedMaps.
     """
     flow, masks = flow[:, :maps.shape[1]], masks[:, :maps.shape[1]]
     candidates = [combine(warp(maps, flow), masks)]  # B, K, H, W
     mass = candidates[0].sum((-2, -1))
     if bool((mass < MIN_MASS).any()):
-        candidates += [combine(warp(blur(maps), flow), masks), combine(maps, masks), maps.mean(1)]
+        candidates += [combine(warp(blur(maps), flow), masks), *maps[:, 2:].unbind(1),
+                       combine(maps, masks), maps.mean(1)]
     warped = candidates[-1]
     for candidate in reversed(candidates[:-1]):
         kept = candidate.sum((-2, -1), keepdim=True) >= MIN_MASS

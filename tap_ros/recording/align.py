@@ -8,12 +8,11 @@ messages have them and by log time where they do not: a frame belongs to an epis
 enclose its stamp, and that is nearest in the log.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 import warnings
 
 import numpy as np
-from tap_ros.base.contract import CONTROL_PERIOD
 from tap_ros.base.errors import RecordingWarning
 from tap_ros.messages.joints import contradicted, PLACE, positions_at
 from tap_ros.messages.stamps import MAX_GAP
@@ -21,6 +20,7 @@ from tap_ros.recording.columns import Columns, NAMES, Track
 from tap_ros.recording.defects import FAR, seconds
 from tap_ros.recording.episode import EpisodeTable
 from tap_ros.recording.metadata import ArmMount
+from tap_ros.recording.periods import command_units
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, Span
 from tap_ros.recording.tracks import read_tracks
@@ -44,13 +44,14 @@ def runs_of(parts: Iterable[Columns]) -> list[list[Columns]]:
 
 
 def assemble(parts: Sequence[Columns], arm: ArmMount,
-             reading: Reading = AS_RECORDED) -> EpisodeTable:
+             reading: Reading = AS_RECORDED, period: float | None = None) -> EpisodeTable:
     """
     Cut files that follow each other into episodes.
 
     :param parts: list of Columns, pictures included, in playing order.
     :param arm: where the arm stood.
     :param reading: Reading; it says where episodes are cut that no marks tell apart.
+    :param period: of control, s, that earlier files of the bag told last; None: they told none.
     :return: EpisodeTable; episodes without any frame are left out.
     """
     tracks, names, gaps, spans = read_tracks(parts, reading)
@@ -69,7 +70,8 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
         parts=parts, starts=clock.starts, spans=spans, stamps=frame.stamp, logs=frame.log,
         places={'frame': (frame.file, frame.index), 'mask': _masks(tracks['mask'], clock, parts),
                 **_goals(tracks, spans, gaps)},
-        actions=_actions(tracks, clock, any('period' in part.topics for part in parts)),
+        actions=_actions(tracks, clock, lambda rows: command_units(
+            parts, tracks, gaps, rows, period)),
         grippers=_grippers(tracks, clock, arm, parts[0].source),
         objects=_by_name(*clock.nearest_rows(tracks['object']), tracks['object'], names,
                          picked[clock.owner]),
@@ -190,24 +192,21 @@ def _without_repeats(frame: Track, owner: np.ndarray) -> tuple[Track, np.ndarray
     return replace(frame, stamp=stamp), owner
 
 
-def _actions(tracks: dict[str, Track], clock: _Clock, velocities: bool) -> np.ndarray:
+def _actions(tracks: dict[str, Track], clock: _Clock,
+             units: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """
     Return (F, 4) float32: row t is what was sent between frame t and frame t + 1, the last wins.
 
     A gripper opening holds until another is commanded. The last row of an episode is zeros.
 
-    :param velocities: commands are m/s, of the control period told last; else metres in one.
+    :param units: returns what rows of commands are multiplied by, see command_units.
     """
     actions = np.zeros((len(clock.times), 4), np.float32)
     twist, command, logs = tracks['twist'], tracks['command'], clock.frame.log
     times, rows = clock.rows(twist)
     step = np.searchsorted(clock.times, times, 'right') - 1
-    period, unit = tracks['period'], np.array([[CONTROL_PERIOD if velocities else 1.0]])
-    if len(period):
-        newest = np.searchsorted(period.log, twist.log[rows], 'right') - 1
-        unit = period.picked(np.maximum(newest, 0))
     with np.errstate(over='ignore'):  # absurd numbers become infinite
-        actions[step[step >= 0], :3] = (unit * twist.picked(rows))[step >= 0]
+        actions[step[step >= 0], :3] = (units(rows) * twist.picked(rows))[step >= 0]
         if len(command) and len(logs):
             by_log = np.argsort(logs, kind='stable')
             newest = np.empty(len(logs), np.int64)

@@ -46,6 +46,7 @@ from tap_ros.recording.episode import Episode, EpisodeTable
 from tap_ros.recording.known import cache_folder, digest_of, ENVIRONMENT, FORMAT, remembered
 from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.metadata import ArmMount, read_mount
+from tap_ros.recording.periods import last_told
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.topic_choice import Bag, list_paths
 
@@ -182,8 +183,12 @@ def open_recordings(paths: Paths, cache_dir: str | Path | None = None, progress:
     # Episodes of the files that follow each other.
     arms = [read_mount(bag.files[0].parent) for bag in bags]
     cutting = reading if len(found) == 1 else replace(reading, episode_seconds=0)
-    runs = [(assemble(run, arm, cutting), bag)
-            for parts, arm, bag in zip(columns, arms, bags) for run in runs_of(parts)]
+    runs = []
+    for parts, arm, bag in zip(columns, arms, bags):
+        period = None  # that is told once holds, also where the clock is set back between files
+        for run in runs_of(parts):
+            runs.append((assemble(run, arm, cutting, period), bag))
+            period = last_told(run, period)
     apart: list[Any] = [asdict(arm) for arm in arms if arm != ArmMount()]
     if len(reading.cameras) > 1:
         apart.append(reading.cameras)

@@ -74,7 +74,8 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
         found = [(entry['recording'], entry['episode'], entry['stamps']) for entry in entries]
         if not isinstance(names, list) or not all(
                 isinstance(name, str) and name for name in names) or len({*names}) < len(names):
-            raise TypeError
+            raise ConfigError(f'{name}: "names" are not usable; expected a list of different ones,'
+                              ' such as ["grasp", "release"]')
         if not all(isinstance(one[0], str) and isinstance(one[1], int) for one in found):
             raise TypeError
     except OSError as error:

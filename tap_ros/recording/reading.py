@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Annotated, TYPE_CHECKING
 
 from tap_ros.base.errors import ConfigError
-from tap_ros.base.options import default_text
+from tap_ros.base.options import check_different, default_text
 from tyro import conf
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ class Reading:
         """Refuse what cannot be read with."""
         if not isinstance(self.image_topic, str) and len(self.image_topic) < 2:
             object.__setattr__(self, 'image_topic', ''.join(self.image_topic))
+        check_different('image_topic', self.cameras)
         if self.crop or self.size:
             self.cut  # noqa: B018  it says what is wrong
         for name in ('rate', 'gap', 'episode_seconds'):

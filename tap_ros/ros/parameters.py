@@ -3,7 +3,7 @@
 """Parameters with a description and a range, and those that several nodes have."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 import math
 import re
 from typing import Any
@@ -22,9 +22,10 @@ from tap_ros.base import plugins
 from tap_ros.base.contract import CONTROL_PERIOD, ROBOT_MASKS
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import listing
-from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
 
 FARTHEST = 100.0  # m; no camera is there
+MOUNT = 'mount_x', 'mount_y', 'mount_z', 'mount_turn'  # parameters that tf_static can replace
 OF_RCLPY = {'use_sim_time', 'start_type_description_service'}  # parameters of any node
 
 
@@ -74,12 +75,14 @@ class Shared:
 @dataclass(frozen=True)
 class MountParameters:
     """
-    Where an arm stands.
+    Where an arm stands; given none of mount_x to mount_turn, where tf_static says that it does.
 
     :param mount_x: x of the base of the arm in the world, m; of its controller's frame "base".
     :param mount_y: y of the base of the arm in the world, m; of its controller's frame "base".
     :param mount_z: z of the base of the arm in the world, m; of its controller's frame "base".
     :param mount_turn: Turn of that frame about the vertical, rad; the base stands upright.
+    :param mount_frame: The base on tf_static, where "world" is another frame of it; empty:
+        joint_prefix and "base".
     :param tool_length: From the flange to the fingertips along its z, m.
     """
 
@@ -87,6 +90,7 @@ class MountParameters:
     mount_y: float = setting(0.0, between=(-10.0, 10.0))
     mount_z: float = setting(0.0, between=(-10.0, 10.0))
     mount_turn: float = setting(0.0, between=(-2 * math.pi, 2 * math.pi))
+    mount_frame: str = ''
     tool_length: float = setting(0.0, between=(0.0, 2.0))
 
 
@@ -256,12 +260,7 @@ def pose_matrix(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarr
     return pose
 
 
-def declared_arm(parameters: Parameters) -> Arm:
-    """Return the Arm at its place, by the parameters of declare_arm."""
-    return replace(get_arm(parameters['arm']), mount=declared_mount(parameters))
-
-
 def declared_mount(parameters: Parameters) -> Mount:
     """Return the place of the arm, by the parameters of declare_mount."""
-    x, y, z = (parameters[f'mount_{axis}'] for axis in 'xyz')
-    return Mount((x, y, z), parameters['mount_turn'], parameters['tool_length'])
+    x, y, z, turn = (parameters[name] for name in MOUNT)
+    return Mount((x, y, z), turn, parameters['tool_length'])

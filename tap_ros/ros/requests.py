@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.base.contract import CAMERA_FRAME
+from tap_ros.base.contract import CAMERA_FRAME, object_names
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import escaped
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
@@ -24,7 +24,7 @@ def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any
     """
     Turn pictures (H, W, 3) and pixels (K, 2) into messages; leave out those that are None.
 
-    :param names: of the objects; by default 'object 1' and so on.
+    :param names: of the objects; by default contract.object_names.
     :param arrays: by field; what is called `objects`, or ends so, are pixels.
     :return: {field: message}.
     :raises ConfigError: for other shapes, and for what is no text or number.
@@ -35,7 +35,7 @@ def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any
             pixels = pixels_of(values, name)
             fields[name] = encode_objects(
                 [text_of(each, 'the name of an object') for each in (
-                    names or [f'object {k + 1}' for k in range(len(pixels))])],
+                    names or object_names(len(pixels)))],
                 pixels, None, to_stamp(0), CAMERA_FRAME, ObjectStates.SOURCE_TRACKED)
         elif values is not None:
             picture = np.asarray(values)

@@ -96,12 +96,17 @@ def make_message(message_type: type[M], fields: Mapping[str, Any]) -> M:
     :param message_type: its class.
     :param fields: by name, nested; bytes are uint8 arrays. What is left out is as by default.
     """
-    message = message_type()
+    return _filled(message_type(), fields)
+
+
+def _filled(message: M, fields: Mapping[str, Any]) -> M:
+    """Set fields of a message; return it."""
     for name, value in fields.items():
-        if isinstance(value, Mapping):
-            value = make_message(type(getattr(message, name)), value)
-        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            kind = message_type.get_fields_and_field_types()[name]  # type: ignore[attr-defined]
+        if isinstance(value, dict):
+            _filled(getattr(message, name), value)
+            continue
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            kind = message.get_fields_and_field_types()[name]  # type: ignore[attr-defined]
             package, kind = kind.removeprefix('sequence<').removesuffix('>').split('/')
             value = [make_message(message_class(f'{package}/msg/{kind}'), one) for one in value]
         elif isinstance(value, np.ndarray):

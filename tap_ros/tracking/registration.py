@@ -11,18 +11,15 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from tap_ros.base.contract import LOST, SEEN
-from tap_ros.tracking.picture import Palette, Picture
+from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane
-from tap_ros.tracking.protocols import Tracked, View
-from tap_ros.tracking.silhouette import centre, silhouette
+from tap_ros.tracking.protocols import Tracked
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 LEAST_FAR = 0.3  # share of an object that has to be seen
 LEAST_SURE = 0.9  # confidence, else not found
 CHANGED = 8.0  # distance of colours
-LEAST_CHANGED = 60  # px of the working picture
 KEPT = 0.1  # weight of places where nothing changed
-MOST_TRIED = 32  # changes, the largest ones, where an object may have been
 PLACES = 6  # that are tried
 TRIED = 4  # turns at each of them that are tried finely
 APART = 0.035  # m from other objects
@@ -121,36 +118,3 @@ def register(first: Picture, picture: Picture, plane: Plane,
             outlines[k] = plane.enlarge(plane.top_pixels(
                 pose.template.outlined(pose.place, pose.angle)))
     return Tracked(pixels, tuple(states), confidence, tuple(outlines))
-
-
-def propose(start: View, goal: View) -> np.ndarray:
-    """
-    Find objects without a click: what one picture shows and the other one does not.
-
-    :param start: the picture in which the objects are wanted; goal: another of the same camera.
-    :return: (N, 2) pixels of the start picture, the largest object first.
-    """
-    plane = Plane(None, start.image.shape[:2])
-    before, after = Picture(start, plane), Picture(goal, plane)
-    changed = cv2.morphologyEx(change(before, after).astype(np.uint8), cv2.MORPH_OPEN,
-                               np.ones((3, 3), np.uint8))
-    count, labels, stats, centres = cv2.connectedComponentsWithStats(changed)
-    found: list[tuple[int, np.ndarray]] = []
-    for i in np.argsort(-stats[1:, cv2.CC_STAT_AREA])[:MOST_TRIED] + 1:
-        if stats[i, cv2.CC_STAT_AREA] < LEAST_CHANGED:
-            break
-        part = labels == i
-        beside = cv2.dilate(part.astype(np.uint8), np.ones((15, 15), np.uint8)) > changed
-        around = beside & ~before.hidden & ~after.hidden
-        if not around.any():
-            continue
-        table = Palette(before.lab[around])
-        here, there = (float(np.median(table.distance(picture.index[part])))
-                       for picture in (before, after))
-        if here <= there:  # something came there
-            continue
-        mask = silhouette(before, centres[i]).mask
-        if mask.any() and not any(np.hypot(*(centre(mask) - other)) < 8 for _, other in found):
-            found.append((int(mask.sum()), centre(mask)))
-    found.sort(key=lambda one: -one[0])
-    return plane.enlarge(np.reshape([at for _, at in found], (-1, 2)))

@@ -30,8 +30,7 @@ class Batch:
     """
     Context pictures and the frames to predict, of B episodes.
 
-    :param context: uint8 (B, C, H, W, 3): start and goal, or in forward prediction the start; in
-        trainings with keyframes also one of these.
+    :param context: uint8 (B, C, H, W, 3): start and goal, or in forward prediction the start.
     :param targets: uint8 (B, T, H, W, 3); some frame where padded.
     :param times: int64 (B, T), when each target was seen; the start picture is time 0.
     :param first: int64 (B, 1), the earliest time a target of this episode could have.
@@ -46,6 +45,8 @@ class Batch:
         targets, video and bare are black, and nothing counts; None: True everywhere.
     :param preference: float32 (B, levels, T), w(t) of Eq. 5 for selection marks and still, of each
         level of recursion; else None.
+    :param keyframes: uint8 (B, levels, H, W, 3), the third picture of each level of recursion;
+        None: networks see two.
     :param augmentation: of all pictures that networks see; None: they see them as they are.
     """
 
@@ -60,6 +61,7 @@ class Batch:
     bare: torch.Tensor | None = None
     seen: torch.Tensor | None = None
     preference: torch.Tensor | None = None
+    keyframes: torch.Tensor | None = None
     augmentation: Augmentation | None = None
 
     @property

@@ -4,27 +4,31 @@
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+import warnings
 
 import numpy as np
-from tap_ros.base.errors import ConfigError
+from tap_ros.base.errors import ConfigError, RecordingWarning
 from tap_ros.base.text import listing
 from tap_ros.training.labels import AROUND_S, Film, film_of
+from tap_ros.training.preference import LEAST_FRAMES
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
 
 
-def film_together(store: 'EpisodeStore', i: int, beside: Sequence['EpisodeStore'],
-                  signals: Sequence[str]) -> Film | None:
+def film_together(store: 'EpisodeStore', i: int, beside: Sequence['EpisodeStore'] = (),
+                  signals: Sequence[str] = (), hidden: np.ndarray | None = None) -> Film | None:
     """
     Describe a demonstration; None for one that is too short.
 
     :param store: of the first camera, whose frames may be labels.
     :param beside: of other cameras.
-    :param signals: names of those that count; their values at the times AROUND_S are columns.
-    :raises ConfigError: for a demonstration that another camera did not see, or without a signal.
+    :param signals: names of those that count, which the demonstration has; their values at the
+        times AROUND_S are columns.
+    :param hidden: (T, H, W) bool, pixels of the first camera that do not count.
+    :raises ConfigError: for a demonstration that another camera did not see.
     """
-    first = film_of(store, i)
+    first = film_of(store, i, hidden)
     if first is None:
         return None
     plain, grey = [first.features[:, :-first.grey]], [first.features[:, -first.grey:]]
@@ -42,12 +46,9 @@ def film_together(store: 'EpisodeStore', i: int, beside: Sequence['EpisodeStore'
         around.append(one.around[:-one.grey])
     episode, seconds = store[i], store.seconds(i)
     for name in signals:
-        values = (np.full(len(seconds), np.nan)
-                  if episode.signals is None or name not in episode.signal_names
-                  else episode.signals[:, episode.signal_names.index(name)].astype(float))
+        assert episode.signals is not None, 'signals_like takes those of all demonstrations'
+        values = episode.signals[:, episode.signal_names.index(name)].astype(float)
         known = np.isfinite(values)
-        if not known.any():
-            raise ConfigError(f'signals: demonstration {i} has no {name}; leave it out')
         plain.append(np.stack([np.interp(
             first.stamps + first.pace * offset, seconds[known], values[known])
             for offset in AROUND_S], 1))
@@ -66,13 +67,29 @@ def _seen_by(other: 'EpisodeStore', seen: tuple[int, int]) -> int | None:
 
 def signals_like(store: 'EpisodeStore', parts: Sequence[str]) -> tuple[str, ...]:
     """
-    Return the names of the signals of the first demonstration that hold one of some parts.
+    Return the names of the signals that hold one of some parts; it warns of those left out.
+
+    Those that some demonstration lacks, which is long enough for labels, are left out.
 
     :raises ConfigError: for a part that none holds; it lists them.
     """
-    names = store[0].signal_names
+    if not parts:
+        return ()
+    names, lacking = dict[str, None](), dict[str, int]()
+    for episode in store:
+        names |= dict.fromkeys(episode.signal_names)
     for part in parts:
         if not any(part in name for name in names):
             raise ConfigError(f'signals: no name holds {part!r}; expected a part of '
                               f'{listing(names, 20) or "a name, but none are recorded"}')
-    return tuple(name for name in names if any(part in name for part in parts))
+    chosen = [name for name in names if any(part in name for part in parts)]
+    for i in np.flatnonzero(store.lengths >= LEAST_FRAMES).tolist():
+        one = store[i]
+        known = set() if one.signals is None else {name for name, is_known in zip(
+            one.signal_names, np.isfinite(one.signals).any(0)) if is_known}
+        lacking |= {name: i for name in chosen if name not in known and name not in lacking}
+    if lacking:
+        warnings.warn('signals: left out, as demonstrations have no value of them: ' + listing(
+            f'{name} (demonstration {i})' for name, i in lacking.items()), RecordingWarning,
+            stacklevel=2)
+    return tuple(name for name in chosen if name not in lacking)

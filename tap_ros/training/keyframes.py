@@ -3,17 +3,20 @@
 """The third picture of a training: labelled frames of the demonstrations that are most alike."""
 
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.base.errors import ImageError
-from tap_ros.prediction.keyframe_bank import KeyframeBank
+from tap_ros.prediction.keyframe_bank import KeyframeBank, MOST_OBJECTS
 from tap_ros.prediction.retrieval import ends_of, neighbours
 from tap_ros.recording.full_size import FullSize
 import torch
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
+    from tap_ros.training.frames import FilledStore
     from tap_ros.training.predictor_config import TrainingConfig
 
 NEIGHBOURS = 5  # demonstrations of which one is drawn, so that its picture must be moved
@@ -21,36 +24,54 @@ NEIGHBOURS = 5  # demonstrations of which one is drawn, so that its picture must
 
 class Keyframes:
     """
-    The labelled frame of each training episode.
+    The labelled frames of each training episode.
 
     :param store: the EpisodeStore; episodes: indices of those to train on.
-    :param preference: of each episode of the store w (levels, T); its largest is the label.
+    :param preference: of each episode of the store w (levels, T); the largest ones are the labels.
+    :param config: of the training.
+    :param filled: the store without the robot: keyframes are as targets are.
     """
 
     def __init__(self, store: 'EpisodeStore', episodes: np.ndarray,
-                 preference: Sequence[np.ndarray]) -> None:
-        self._store, self._episodes = store, episodes
-        self._labels = [int(preference[i][0].argmax()) for i in episodes.tolist()]
-        self._ends = np.stack([ends_of(*store.frames(i)[[0, -1]]) for i in episodes.tolist()])
+                 preference: Sequence[np.ndarray], config: 'TrainingConfig',
+                 filled: 'FilledStore | None' = None) -> None:
+        self._store, self._episodes, self._config, self._filled = store, episodes, config, filled
+        rows = episodes.tolist()
+        self._labels = np.stack([preference[i].argmax(1) for i in rows])  # N, levels
+        given = store if filled is None or not config.fill_context else filled
+        self._ends = np.stack([ends_of(*given.frames(i)[[0, -1]]) for i in rows])
         self._near = (neighbours(self._ends, NEIGHBOURS)[0] if len(episodes) > 1
                       else np.zeros((1, 1), np.int64))
+        shown = store if filled is None else filled
         self._pictures = torch.from_numpy(np.stack([
-            store.frames(i)[t] for i, t in zip(episodes.tolist(), self._labels)]))
+            shown.frames(i)[at] for i, at in zip(rows, self._labels)]))
 
     def draw(self, chosen: np.ndarray, rng: np.random.Generator) -> torch.Tensor:
-        """Return uint8 (B, 1, H, W, 3), for each episode that of one of the most alike others."""
+        """Return uint8 (B, levels, H, W, 3), of each episode those of one of the most alike."""
         near = self._near[np.searchsorted(self._episodes, chosen)]
         return self._pictures[near[np.arange(len(near)), rng.integers(near.shape[1], size=len(
-            near))]][:, None]
+            near))]]
 
-    def bank(self, config: 'TrainingConfig') -> KeyframeBank:
+    def bank(self) -> KeyframeBank:
         """Return the bank that goes with the weights, of pictures at the recorded size."""
-        full = FullSize(self._store, config.crop)
+        levels, small = self._labels.shape[1], self._pictures.flatten(0, 1)
+        full = FullSize(self._store, self._config.crop)
 
         def shown(n: int) -> np.ndarray:
-            return full.picture(int(self._episodes[n]), self._labels[n])
+            return full.picture(int(self._episodes[n // levels]), int(self._labels.flat[n]))
 
-        try:
-            return KeyframeBank.choose(self._ends, shown)
-        except ImageError:  # some cannot be read one by one, or cameras differ
-            return KeyframeBank.choose(self._ends, lambda n: self._pictures[n].numpy())
+        choose = partial(KeyframeBank.choose, self._ends, objects=self._objects(), levels=levels)
+        if self._filled is None:
+            with suppress(ImageError):  # some cannot be read one by one, or cameras differ
+                return choose(shown)
+        return choose(lambda n: small[n].numpy())
+
+    def _objects(self) -> np.ndarray | None:
+        """Return where objects are, as KeyframeBank takes it."""
+        places = [self._store[i].object_pixels[[0, *at]][:, :MOST_OBJECTS]
+                  for i, at in zip(self._episodes.tolist(), self._labels)]
+        objects = np.full((len(places), len(places[0]), max(one.shape[1] for one in places), 2),
+                          np.nan, np.float32)
+        for row, one in zip(objects, places):
+            row[:, :one.shape[1]] = one
+        return objects if np.isfinite(objects).any() else None

@@ -9,11 +9,13 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from tap_ros.base.errors import ConfigError
+from tap_ros.base.text import escaped, listing
 from tap_ros.images.robot_mask import hidden_pixels, RobotMask
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import Mark, Marks, read_marks
 from tap_ros.recording.reading import reading_of
-from tap_ros.training.labels import Film, film_of, fit, SIZE, spread
+from tap_ros.training.films import film_together, signals_like
+from tap_ros.training.labels import Film, fit, SIZE, spread
 from tap_ros.training.preference import describe, LEAST_FRAMES, still
 from tap_ros.training.run import bags_of
 
@@ -81,22 +83,35 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
     if not chosen:
         raise ConfigError(f'marks: none of the {len(marks.episodes)} marked demonstrations is '
                           'trained on; mark some of those that are not held out')
+    if config.mark_name and config.mark_name not in marks.names:
+        raise ConfigError(
+            f'mark_name: {escaped(config.mark_name, 60)} is none of the marks; expected '
+            + (f'one of {listing(marks.names)}' if marks.names else 'marks that have names'))
+    count = len(marks.names) if config.mark_name else config.recursion
     for i in chosen:
-        if len(marks.episodes[i]) != config.recursion:
+        if len(marks.episodes[i]) != count:
+            one = f', or choose one of {listing(marks.names)} by --mark-name' * bool(marks.names)
             raise ConfigError(
-                f'marks: demonstration {i} has {len(marks.episodes[i])}, and each needs '
-                f'{config.recursion}, one for a level of recursion; mark as many, or give '
-                '--recursion')
-    films = [film_of(store, i, hidden_of(store, i, config.robot_mask)) for i in range(len(store))]
+                f'marks: demonstration {i} has {len(marks.episodes[i])}, and each needs {count}, '
+                f'one for a level of recursion; mark as many, or give --recursion{one}')
+    beside = [open_recordings(bags_of(config), progress=False, reading=replace(
+        reading_of(config), image_topic=topic, crop='whole', size=SIZE))
+        for topic in config.label_topic]
+    signals = signals_like(store, config.label_signals)
+    films = [film_together(store, i, beside, signals, hidden_of(store, i, config.robot_mask))
+             for i in range(len(store))]
+    # All marks of a demonstration are found together, also where one is trained on.
     moments = {i: np.array([
         store[i].stamps[(first + last) // 2] - store[i].stamps[0]
         for first, last in marks.episodes[i]]) / 1e9 for i in chosen}
     of_chosen = [one for i in chosen if (one := films[i])]
     model, left_out = fit(of_chosen, list(moments.values()))
     order = slice(None) if config.forward else slice(None, None, -1)
+    if config.mark_name:
+        order = slice(k := marks.names.index(config.mark_name), k + 1)
     about = [_worth(of_chosen, np.array(true), np.array(guess)) for true, guess in zip(
         np.transpose(list(moments.values())),
-        np.transpose(left_out) if left_out else [()] * config.recursion)][order]
+        np.transpose(left_out) if left_out else [()] * count)][order]
     labels: list[np.ndarray | None] = []
     for i, one in enumerate(films):
         if one is None:

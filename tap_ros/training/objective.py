@@ -240,7 +240,7 @@ def _recursive_loss(networks: Networks, targets: Targets, prediction: Prediction
         context, measured = (
             following if config.forward else torch.cat([pictures[:, :1], following], 1)
             for pictures in (context, measured))
-        prediction = networks.predict(context, z)
+        prediction = networks.predict(targets.beside(context, level), z)
         # Preferences lie between the inputs of this level.
         between = replace(batch, valid=valid | ~left[:, None], preference=(
             None if batch.preference is None else batch.preference[:, level:]))

@@ -59,17 +59,18 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
                               '--held-out, a --test-fraction above 0, or leave --patience out')
         preference, run.about = episode_preferences(run.store, config, run.training)
         network, helpers = make_networks(run)
+        filled = None if config.robot_mask == 'none' else FilledStore(
+            run.store, config.robot_mask, progress)
         keyframes = None
         if config.keyframes:
             assert preference is not None, 'marks label the frames'
-            keyframes = Keyframes(run.store, run.training, preference)
-            network.bank = keyframes.bank(config)
+            keyframes = Keyframes(run.store, run.training, preference, config, filled)
+            network.bank = keyframes.bank()
         state = run.begin(network, AVERAGE_DECAY, helpers)
         state.precision = state.precision or pick_precision(config.precision, run.device)
         networks = Networks(state.network, **dict[str, Any](state.helpers.items()),
                             autocast=make_autocast(state.precision, run.device))
-        frames, filled = None, None if config.robot_mask == 'none' else FilledStore(
-            run.store, config.robot_mask, progress)
+        frames = None
         # Copying would be most of the time of a step on a GPU; what does not fit stays in files.
         if run.device.type == 'cuda' and has_room(
                 run.device, *[run.store] * (1 if filled is None else 2)):
@@ -150,9 +151,7 @@ def draw_batch(store: EpisodeStore, episodes: np.ndarray, config: TrainingConfig
     chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
     batch = make_batch(store, chosen, sampling_of(config), rng, pictures)
     if pictures.keyframes is not None:
-        third = pictures.keyframes.draw(chosen, rng).to(batch.context.device)
-        batch = replace(batch, context=torch.cat([batch.context, third], 1),
-                        bare=batch.measured)
+        batch = replace(batch, keyframes=pictures.keyframes.draw(chosen, rng))
     return replace(batch, augmentation=Augmentation.draw(
         len(chosen), config.colour, config.brightness, rng))
 

@@ -5,12 +5,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import Folder
 from tap_ros.images.robot_mask import RobotMask
+from tap_ros.prediction.keyframe_bank import MOST_LEVELS
+from tap_ros.recording.reading import Topics
 from tap_ros.training.run_config import RunConfig
+from tyro import conf
 
 Mode = Literal['bidirectional', 'forward']  # contract.MODES
 Loss = Literal['fix', 'min', 'genmin']
@@ -44,10 +47,14 @@ class TrainingConfig(RunConfig):
         labels learned from 'marks' as a prior. fix with marks has its target at the label.
     :param marks: JSON file of demonstrations whose bottleneck a person has marked, see `mark`.
         Start and goal are then drawn around the label.
+    :param mark_name: train on the marks of this name alone, where a demonstration has several.
+    :param label_topic: cameras that tell the moment beside the predictor's own, as of the wrist.
+    :param label_signals: parts of names of signals that tell it, too, as in `label`.
     :param label_weight: of log w(t) beside the l1 error, with selection marks; w(t) is how likely
         a frame is the label. 0: any of the likeliest frames alike.
     :param keyframes: the network is also given the labelled frame of the demonstration that is
-        most alike, to copy from; the weights file holds such frames of up to 64 demonstrations.
+        most alike, to copy from, with recursion one for each level; the weights file holds such
+        frames of up to 64 demonstrations, and where the objects are in them.
     :param gan: add the GAN's terms (Eq. 7).
     :param latent: 'vae' adds z (Eq. 9, with a GAN Eq. 10).
     :param fraction: share of the episode at which fix has its target.
@@ -104,6 +111,10 @@ class TrainingConfig(RunConfig):
     loss: Loss = 'genmin'
     selection: Selection = 'progress'
     marks: str = ''
+    mark_name: str = ''
+    label_topic: Topics = ()
+    label_signals: Annotated[tuple[str, ...], conf.arg(
+        metavar='PART [PART ...]', help_behavior_hint='(default: none)')] = ()
     label_weight: float = 0.01
     keyframes: bool = False
     gan: bool = False
@@ -170,11 +181,17 @@ class TrainingConfig(RunConfig):
         if self.marks and (self.min_crop < 1 or self.start_crop):
             raise ConfigError('marks: start and goal are drawn around the label; leave min_crop '
                               'and start_crop out, which draw them anywhere')
+        if (self.label_topic or self.label_signals) and not self.marks:
+            raise ConfigError('label_topic, label_signals: they tell the moment of marks; give '
+                              '--marks')
         if self.keyframes and (not self.marks or self.forward or self.new_pixels
-                               or self.recursion > 1):
-            raise ConfigError('keyframes: they are the frames that one mark labels, between a '
-                              'start and a goal, and copied instead of new pixels; give --marks '
-                              'and --no-new-pixels, and leave mode and recursion out')
+                               or self.recursion > MOST_LEVELS):
+            raise ConfigError('keyframes: they are the frames that marks label, between a start '
+                              f'and a goal, at most {MOST_LEVELS}, and copied instead of new '
+                              'pixels; give --marks and --no-new-pixels, and leave mode out')
+        if self.mark_name and (not self.marks or self.recursion > 1):
+            raise ConfigError('mark_name: it chooses one of the marks of a demonstration; give '
+                              '--marks, and leave recursion out')
         if self.recursion > 1 and self.loss == 'fix':
             raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
                               'loss fix')

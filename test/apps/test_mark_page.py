@@ -19,7 +19,7 @@ from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.__main__ import main
-from tap_ros.apps.label_command import Options
+from tap_ros.apps.label_command import Options, WholeReading
 from tap_ros.apps.mark_command import MarkServer, parse_names, words_of
 from tap_ros.apps.marking import Marking
 from tap_ros.base.errors import ConfigError
@@ -110,6 +110,8 @@ def test_marks_are_written_at_once_and_what_is_refused_changes_nothing(page, bag
     for place, data, headers, code in (
             ('mark', b'{"episode": 1, "frames": [0]}', {}, 400), ('mark', b'x', {}, 400),
             ('mark', b'{"episode": 1, "frames": ""}', {}, 400), ('mark', b'[' * 60000, {}, 400),
+            ('mark', b'{"episode": 1, "frames": [true, 2]}', {}, 400),
+            ('mark', b'{"episode": true, "frames": [2]}', {}, 400),
             ('mark', b' ' * 70000, {}, 413), ('mark', b'', {'Content-Length': '-1'}, 413),
             (f'frame/{"9" * 5000}/0', None, {}, 404), ('frame/0', None, {}, 404),
             ('about/0/0', None, {}, 404), ('about/x', None, {}, 404), ('about', None, {}, 404),
@@ -180,8 +182,10 @@ def test_marks_with_names_are_complete_and_in_their_order(bag, store, tmp_path):
     marking.mark(2, [3, 6])
     assert read_marks(path, store).names == ('grasp', 'release')
     assert Marking(store, [str(bag)], path).names == ('grasp', 'release')
-    Marking(store, [str(bag)], path, ['a', 'b']).mark(3, [3, 6])
-    assert read_marks(path, store).names == ('a', 'b')
+    for names in (['release', 'grasp'], ['a', 'b'], ['grasp']):  # else marks change their meaning
+        with pytest.raises(ConfigError, match='names: .* are grasp, release; leave --names out'):
+            Marking(store, [str(bag)], path, names)
+    path.write_text(path.read_text().replace('"names": ["grasp", "release"], ', ''))
     with pytest.raises(ConfigError, match='names: grasp, but demonstration 2 has 2 marks'):
         Marking(store, [str(bag)], path, ['grasp'])
     assert parse_names('grasp, release') == ['grasp', 'release'] and parse_names('') == []
@@ -220,12 +224,14 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
     for i in range(2):
         assert not marking.commands(words)
         marking.mark(i, [3, 6])
-    label, train = map(shlex.split, marking.commands(['--rate', '4']))
+    label, train = map(shlex.split, marking.commands(
+        ['--crop', 'centre', '--rate', '4', '--gap', '2.0']))
     assert label == ['python', '-m', 'tap_ros', 'label', str(bag), '--marks', 'my marks.json',
-                     '--out', 'labels/squares']
-    assert train[3:] == ['train', 'predictor', str(bag), '--marks', 'my marks.json', '--rate',
-                         '4', '--crop', 'centre', '--size', '64', '--recursion', '2',
-                         '--test-fraction', '0.25', '--threads', '1', '--out', 'runs/squares']
+                     '--rate', '4', '--gap', '2.0', '--out', 'labels/squares']
+    assert train[3:] == ['train', 'predictor', str(bag), '--marks', 'my marks.json', '--crop',
+                         'centre', '--rate', '4', '--gap', '2.0', '--size', '64', '--recursion',
+                         '2', '--keyframes', '--no-new-pixels', '--test-fraction', '0.25',
+                         '--threads', '1', '--out', 'runs/squares']
     one = Marking(store, [str(bag)], tmp_path / 'one.json', ['grasp'])
     for i in range(2):
         one.mark(i, [3])
@@ -235,6 +241,7 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
     assert f'\n{words}\n' in page, 'the page of the first hour has this command'
     asked = parse(Options, label[4:])
     assert asked.recordings == (str(bag),) and asked.marks == 'my marks.json'
+    assert asked.reading == replace(WholeReading(), rate=4, gap=2)
 
 
 def test_connections_to_the_page_are_few_and_end_in_time(page, monkeypatch):

@@ -40,7 +40,7 @@ def test_it_predicts_what_the_predictor_does_in_the_pixels_of_the_start_picture(
     subgoal, = SubgoalPredictor.load('push2').predict(
         episode.frames[0], episode.frames[-1], start, goal)
     told = capsys.readouterr().out
-    found = np.array(re.findall(r'object \d at ([\d.]+),([\d.]+)', told), float)
+    found = np.array(re.findall(r'object_\d at ([\d.]+),([\d.]+)', told), float)
     assert found == pytest.approx((subgoal.expected_pixels + 0.5) * 3 - 0.5, abs=0.2)
     assert str(out) in told
     picture = cv2.imread(str(out))
@@ -98,10 +98,12 @@ def test_the_part_that_is_used_is_asked_for_or_that_of_the_training(episode, tmp
     for options in (['--weights', str(weights)], ['--crop', 'centre'], ['--crop', '32,0,192']):
         assert main(['predict', *map(str, files), *options, '--objects', *words(start),
                      '--goal-objects', *words(goal), '--out', str(tmp_path / 'out.png')]) == 0
-        told = re.findall(r'object \d at ([\d.]+),([\d.]+)', capsys.readouterr().out)
+        told = re.findall(r'object_\d at ([\d.]+),([\d.]+)', capsys.readouterr().out)
         assert np.array(told, float) == pytest.approx(
             (subgoal.expected_pixels + 0.5) * 3 - 0.5 + [32, 0], abs=0.2)
-    assert '--crop centre' in refusal(capsys, *map(str, files))
+    assert '--crop whole' in refusal(capsys, *map(str, files))
+    assert main(['predict', *map(str, files), '--crop', 'whole', '--objects', '255,191',
+                 '--goal-objects', '0,0', '--out', str(tmp_path / 'out.png')]) == 0
     save_weights(weights, network, 'predictor', network.config, {
         'settings': {'crop': 'centre', 'size': 64}, 'camera_size': [144, 256]})
     assert main(['predict', *map(str, files), '--weights', str(weights), '--out',

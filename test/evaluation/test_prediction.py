@@ -292,6 +292,7 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
                str(tmp_path / 'out')])
     shown = capsys.readouterr().out
     assert 'positions: unknown' in shown and 'in 2 marked episodes' in shown
+    assert 'all episodes, also those trained on' in shown and 'held-out' not in shown
     scores = json.loads((tmp_path / 'out' / 'scores.json').read_text())['scores']
     hits = scores.pop('marks')
     seconds, error = hits.pop('seconds'), hits.pop('error')

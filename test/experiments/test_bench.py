@@ -4,8 +4,9 @@
 
 import mmap
 import os
+from pathlib import Path
 
-from experiments.bench import growth, recording
+from experiments.bench import busy, growth, recording
 from experiments.bench.mppi import mppi
 from experiments.bench.rows import Row, show
 import numpy as np
@@ -19,7 +20,7 @@ def test_all_frames_are_opened_beside_another_job(monkeypatch):
     *ours, pictures = recording.run(args)
     assert [row.ratio > 0 for row in ours] == [True, True]
     assert '20 JPEG frames' in pictures.what and pictures.reached
-    monkeypatch.setattr(recording, '_build_cache', lambda paths, scratch: 1)
+    monkeypatch.setattr(recording, 'build_cache', lambda paths, scratch: 1)
     with pytest.raises(RuntimeError, match='saw 1 of'):
         recording.run(args)
 
@@ -34,6 +35,34 @@ def test_memory_is_what_is_held_beside_mapped_files(tmp_path):
     with mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as ours:
         ours[:] = bytes([1]) * size
         assert growth.held(os.getpid()) - before > 0.9 * size
+
+
+@pytest.mark.slow
+def test_a_recording_larger_than_the_memory_is_inspected(tmp_path):
+    limit = 130 * 10**6
+    assert growth.write(tmp_path / 'bag', 54, 256, 12) > limit
+    seconds, memory = growth.measure(['inspect', str(tmp_path / 'bag')], tmp_path / 'cache', limit)
+    assert seconds > 0 and 0 < memory < limit
+    with pytest.raises(RuntimeError, match='inspect'):  # the limit holds
+        growth.measure(['inspect', str(tmp_path / 'bag')], tmp_path / 'new', limit // 4)
+
+
+def test_work_is_done_in_turns_alone_and_beside_others():
+    found = []
+
+    def children():
+        return sum(len(one.read_text().split()) for one in Path('/proc/self/task').glob(
+            '*/children'))
+
+    def seconds():
+        found.append(children() - before)
+        return 1 + found[-1]
+
+    before = children()
+    row = busy.compare(busy.Work('nothing', 1, seconds), 2, 3)
+    assert found == [0, 3, 0, 3] and children() == before
+    assert row.ratio == 4 and row.reached == (busy.CORES == 1)
+    assert row.what == 'nothing beside 3 busy processes' and row.to == 'alone (4.00 to 4.00)'
 
 
 def test_a_row_that_misses_its_aim_says_why():

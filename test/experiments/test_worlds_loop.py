@@ -58,6 +58,13 @@ def test_marked_is_where_the_first_object_rests_at_its_goal_and_the_other_has_no
     assert first == last and first in (3, 4)
 
 
+def test_a_fixed_time_is_marked_half_way_and_at_a_quarter_in_every_demonstration(tmp_path):
+    bag = write_moves(tmp_path, [[4, 4]] * 9, ('success', 'failure'))
+    marks = read_marks(loop.mark_times(bag, 2), open_recordings([bag])).episodes
+    assert {i: list(map(tuple, those)) for i, those in marks.items()} == dict.fromkeys(
+        (0, 1), [(2, 2), (4, 4)])
+
+
 def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
         tmp_path, monkeypatch):
     ran = []

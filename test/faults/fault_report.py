@@ -27,15 +27,13 @@ MAX_REASONS = 4
 HEAD = """\
 # Faults
 
-Each row is a fault that was injected into real nodes, processes that talk over DDS, or into a
-disk. *Held*: trials in which what must happen did happen, and no node logged a traceback or an
-error that the fault does not explain. *Seen*: the worst of all trials unless said otherwise. Made
-by `{command}` in {minutes:.0f} minutes, {dates}, commit {commits},
-on {machines}; [faults.json](faults.json) has each row's.
+Each row is a fault that was injected into real nodes, during a goal unless it says otherwise, or
+into a disk. *Held*: trials that ended as they must, without a traceback or an unexplained error in
+a log. *Seen*: the worst of all trials unless said otherwise. Made by `{command}` in
+{minutes:.0f} minutes, {dates}, commit {commits}, on {machines}; data:
+[faults.json](faults.json).
 
-![slowest reaction of all trials, and what was promised](faults.png)
-
-*The slowest reaction (bars) and what was promised (lines).*
+![slowest reaction of all trials (bars), and what was promised (lines)](faults.png)
 
 | injected | must happen | held | seen |
 | --- | --- | ---: | --- |
@@ -196,7 +194,8 @@ def _line(injected, promise, rows):
     figures = [row['figure'] for row in rows if row['figure'] is not None]
     seen = ' / '.join(f'{figure:.3g}' if isinstance(figure, float) else figure
                       for figure in figures)
-    parts = [f'{seen} {rows[0]["what"]}'.strip() if figures else '',
+    what = re.sub(r'^s (?:until|for) [a-z ]+', 's ', rows[0]['what']).strip()  # 's (median)'
+    parts = [f'{seen} {what}'.strip() if figures else '',
              *(row['why_not'] for row in rows)]
     words = '; '.join(filter(None, parts)).replace('|', '\\|').replace('<', '\\<')
     share = f'{held} of {tried}'

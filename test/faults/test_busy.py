@@ -19,8 +19,8 @@ TOO_SLOW = 'max_age|no command could be sent|stood still'  # what a goal may end
 AGES = (0.1, 0.2, 0.4)  # s; a plan of two objects takes .3 s on two idle cores
 
 
-@fault(f'{CROWD} busy processes beside everything, in lock-step', f'goals of {STEPS} steps, '
-       'directly and via a subgoal, end bit for bit as alone', 8, 's for the goal')
+@fault(f'{CROWD} busy processes, in lock-step', f'goals of {STEPS} steps end bit for bit as '
+       'alone', 8, 's for the goal')
 def test_busy_lock_step(rig, trials):
     rig.need('visual_mpc_node', 'predictor_node', sim='lock-step')
 
@@ -45,9 +45,8 @@ def test_busy_lock_step(rig, trials):
             assert beside == alone, f'alone: {alone}; beside them: {beside}'
 
 
-@fault(f'{CROWD} busy processes beside everything, in real time', 'no node is called dead; the '
-       'goal succeeds, or ends with the reason; zero is sent last', 10, 'commands of 6 (least)',
-       min)
+@fault(f'{CROWD} busy processes, in real time', 'no node is called dead; the goal succeeds or '
+       'says why not; zero last', 10, 'commands of 6 (least)', min)
 def test_busy_real_time(rig, trials):
     for trial in trials:
         rig.need('visual_mpc_node', 'predictor_node', sim='real')
@@ -64,8 +63,8 @@ def test_busy_real_time(rig, trials):
             assert rig.arm.seconds_to_stop(begin) < float('inf'), 'no zero was sent'
 
 
-@fault('a planner whose plans take longer than max_age', f'within {END_S:g} s the goal of two '
-       'steps succeeds with smaller plans, or ends and names both times', 9, 's for the goal')
+@fault('plans take longer than max_age', f'within {END_S:g} s a goal of two steps succeeds, or '
+       'names both times', 9, 's for the goal')
 def test_late_plans(rig, trials):
     for trial in trials:
         age = AGES[trial % len(AGES)]

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.ros
 
 DEFAULT_DEPTH = 10  # of the queue of a client in ROS 2
 SOON_S = 10.0
-CLIENTS = '12, 16 or 64 clients at once for 10 s, or 16 for 2 min'
+CLIENTS = '12, 16 or 64 clients for 10 s, or 16 for 2 min'
 ANSWERED = 'each call is answered'
 
 
@@ -56,8 +56,8 @@ def test_clients_throughput(rig, trials):
             assert many >= 1.5 * one, f'{many:.0f} answers a second instead of {one:.0f}'
 
 
-@fault('requests for too much: objects, samples, pixels', 'answered or refused with the bound '
-       f'within {SOON_S:g} s, and the next good request is answered', 14, 's until the answer')
+@fault('too many objects, samples or pixels', f'answered or refused within {SOON_S:g} s; the '
+       'next good request is answered', 14, 's until the answer')
 def test_large_requests(rig, trials):
     requests = list(large_requests())
     for trial in trials:

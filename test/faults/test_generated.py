@@ -222,8 +222,8 @@ class Target:
 
 
 @pytest.mark.errors(r'^\[ERROR\](?!.*Traceback)')  # bad messages are named, in one line each
-@fault('generated messages: wrong sizes, extreme numbers, control characters', 'no node ends, '
-       'each call is answered, good calls are answered well in between', 50_000)
+@fault('random messages: wrong sizes, extreme numbers, control characters', 'no node ends; each '
+       'call is answered, good ones well', 50_000)
 def test_generated_messages(rig, trials):
     target, seed = Target(rig), 0
     try:

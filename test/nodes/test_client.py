@@ -94,7 +94,7 @@ def test_the_command_prints_places_and_draws_what_the_node_answers(loop, tmp_pat
     said = capsys.readouterr().out
     wanted, = SubgoalPredictor.load(DEFAULT_PREDICTOR).predict(
         start.image, goal.image, start.pixels, goal.pixels)
-    found = np.array(re.findall(r'object \d at ([\d.-]+),([\d.-]+)', said), float)
+    found = np.array(re.findall(r'object_\d at ([\d.-]+),([\d.-]+)', said), float)
     assert found == pytest.approx(wanted.expected_pixels, abs=0.06)
     picture = cv2.imread(str(out))
     assert picture.shape[1] > 1.5 * picture.shape[0] and picture.std() > 20

@@ -137,7 +137,7 @@ def test_an_object_that_is_dragged_is_brought_there_via_a_subgoal(explored, brow
             page.click('#subgoal-run')
             page.wait_for_function('state.run.running')
             page.wait_for_function('!state.run.running', timeout=240_000)
-        assert re.fullmatch(r'via subgoal: .* px from the goal, .*\(\d+ steps\)',
+        assert re.fullmatch(r'via subgoal: .* cm from their goals \(\d+ steps\)',
                             newest(page))
         assert explored.away() < SUCCESS_DISTANCE
         reset(page)

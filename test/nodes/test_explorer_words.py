@@ -78,6 +78,8 @@ def test_whoever_says_too_much_of_itself_fills_no_memory():
      '-r /camera/image_raw:=/cam)', 'nothing has come from the camera (no node publishes it; '
      'published are /cam: remap one, -r /camera/image_raw:=/cam)'),
     ('nothing has come on /my/own, no', 'nothing has come from /my/own, no'),
+    ('nothing new has come on /camera/image_raw, /objects, /joint_states',
+     "nothing new has come from the camera, objects, the arm's joints"),
     ('1/2 px from the goal', '1/2 px from the goal'), ('', '')])
 def test_a_refusal_is_told_in_words_and_keeps_its_remedy(said, meant):
     assert plain(said) == meant

@@ -2,15 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the pages say can be run, followed and found."""
 
+from contextlib import suppress
+from importlib import import_module
 import os
 from pathlib import Path
 import re
+import shlex
 import subprocess
 import sys
 
 import cv2
 import pytest
 import tap_ros
+from tap_ros.apps.cli import read
+from tap_ros.base.errors import TapError
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.md',
@@ -39,8 +44,8 @@ def test_the_python_of_the_readme_runs_and_prints_what_it_says(tmp_path):
     page = (ROOT / 'README.md').read_text()
     block, = re.findall(r'^```python\n(.*?)^```$', page, re.M | re.S)
     written = {f'{name}.png' for name in re.findall(r"\('(\w+)', \w+\)", block)}
-    command, = re.findall(r'-m tap_ros predict (.*)', page)
-    assert 'subgoal.png' in written and re.search(r'--out (\S+)', command)[1] not in written
+    made = re.findall(r'-m tap_ros predict .*--out (\S+)', page)
+    assert 'subgoal.png' in written and made and written.isdisjoint(made)
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
     run = subprocess.run([sys.executable, '-c', block], cwd=tmp_path, capture_output=True,
@@ -49,6 +54,15 @@ def test_the_python_of_the_readme_runs_and_prints_what_it_says(tmp_path):
     said, = re.findall(r'print\(.*# (\[\[.*\]\])', block)
     assert run.stdout.split() == said.split()
     assert cv2.imread(str(tmp_path / 'subgoal.png')).shape == (256, 256, 3)
+
+
+@pytest.mark.parametrize('page', WRITTEN, ids=of)
+def test_the_commands_of_the_pages_have_these_options(page):
+    for program, words in re.findall(r'^python -m (tap_ros|experiments) (.*)$', page.read_text(),
+                                     re.M):
+        line = import_module(f'{program}.__main__').LINE
+        with suppress(TapError):  # a recording that is not here
+            read(line, shlex.split(words, comments=True))
 
 
 @pytest.mark.slow

@@ -1,10 +1,10 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The skeletons of docs/extending.md, copied out into a package and run as they stand."""
+"""The skeletons that docs/extending.md names, copied as a package and run as they stand."""
 
 import os
 from pathlib import Path
-import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -13,27 +13,24 @@ import pytest
 from tap_ros.base.plugins import BUILT_IN
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / 'docs' / 'extending.md').read_text()
-FILES = re.findall(r'^```python\n# (\S+)\n(.*?)^```$', PAGE, re.M | re.S)
-LISTED = tomllib.loads(re.search(r'^```toml\n(.*?)^```$', PAGE, re.M | re.S)[1])[
-    'project']['entry-points']
+EXAMPLES = ROOT / 'examples'
+LISTED = tomllib.loads((EXAMPLES / 'pyproject.toml').read_text())['project']['entry-points']
 
 
 def test_each_part_has_a_skeleton_a_test_and_a_name():
     assert set(LISTED) == set(BUILT_IN)
-    parts = {place.partition(':')[0].rpartition('.')[2]
-             for group in LISTED.values() for place in group.values()}
-    assert [name for name, _ in FILES] == [
-        name for part in re.findall(r'my_package/(\w+)\.py', PAGE)
-        for name in (f'my_package/{part}.py', f'test_{part}.py')]
-    assert parts == {Path(name).stem for name, _ in FILES if '/' in name}
+    page = (ROOT / 'docs' / 'extending.md').read_text()
+    for group in LISTED.values():
+        (name, place), = group.items()
+        part = place.partition(':')[0].replace('.', '/')
+        for file in (f'{part}.py', f'test_{Path(part).name}.py'):
+            assert (EXAMPLES / file).exists() and f'](../examples/{file})' in page, file
+        assert any(use in page for use in (f':={name}', f"'{name}:")), name
 
 
 @pytest.mark.slow
 def test_the_skeletons_run_and_are_found_by_name(tmp_path):
-    for name, text in FILES:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(text)
+    shutil.copytree(EXAMPLES, tmp_path, dirs_exist_ok=True)
     about = tmp_path / 'my_package-1.0.dist-info'
     about.mkdir()
     (about / 'METADATA').write_text('Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n')

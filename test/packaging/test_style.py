@@ -17,7 +17,7 @@ import sys
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ('tap_ros', 'sim_bridge', 'experiments', 'test', 'launch', 'scripts')
+FOLDERS = ('tap_ros', 'sim_bridge', 'experiments', 'test', 'launch', 'scripts', 'examples')
 FILES = ('setup.py', 'docs/conf.py', 'docs/site/conf.py')
 HEADER = ['# Copyright 2026 The tap_ros authors', '# SPDX-License-Identifier: Apache-2.0']
 CHECKS = {  # .flake8 gives the reasons of the options

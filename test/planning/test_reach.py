@@ -64,7 +64,7 @@ def test_one_command_a_picture_until_the_budget_is_spent(mpc):
         assert isinstance(reach.step(look(t)), Wait)  # the same picture again
     end = reach.step(look(3))
     assert isinstance(end, End) and end.outcome == 'spent' and reach.steps == 3
-    assert '4.0 px' in end.message and '3 spent' in end.message
+    assert reach.distance == pytest.approx(4) and 'budget of 3 is spent' in end.message
 
 
 def test_a_goal_that_is_reached_ends_at_once_and_the_default_budget_is_the_papers(mpc):
@@ -219,6 +219,19 @@ def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
         assert isinstance(command, Command) and command.stage == stage  # no third round
         reach.sent()
     assert reach.targets == [first, second, GOAL] and reach.switches == [1, 2]
+
+
+@pytest.mark.parametrize('passed', [0.0, 3.0])
+def test_a_subgoal_may_be_passed_farther_off_than_the_goal_is_reached(mpc, passed):
+    reach = Reach(mpc, ReachConfig(10, reached=1.0, passed=passed), 3)
+    reach.step(look(0))
+    reach.set_targets([Target(START + 4), GOAL])
+    for pixels, stage in ((START, 0), (START + 2, int(passed > 0)), (START + 4, 1), (
+            GOAL.pixels + 2, 1)):
+        command = reach.step(look(reach.steps, pixels))
+        assert isinstance(command, Command) and command.stage == stage
+        reach.sent()
+    assert isinstance(reach.step(look(4, GOAL.pixels)), End)
 
 
 def test_a_later_round_knows_where_the_gripper_met_something(mpc, monkeypatch):

@@ -45,6 +45,17 @@ def full(episode, t):
     return picture
 
 
+TIMES = [0, 22, 11]  # of the start and of keyframes of two levels, the later one first
+
+
+@pytest.fixture(scope='module')
+def levels(episodes, ends):
+    """Two keyframes of each demonstration, and where objects are in them."""
+    return KeyframeBank.choose(
+        ends, lambda n: full(episodes[n // 2], TIMES[1 + n % 2]), np.stack([
+            one.object_pixels[TIMES] for one in episodes]).astype(np.float32), 2)
+
+
 @pytest.fixture(scope='module')
 def network(bank):
     made = lively_network(num_context=3, image_size=64)
@@ -96,11 +107,18 @@ def test_the_network_is_given_the_third_picture_by_whoever_asks(network, bank, e
         alone, = ask(predictor, episodes[i])
         for shown in (alone.image, together[b][0].image):
             assert np.abs(shown.astype(int) - to_uint8(given.image)[b]).mean() < 0.1
-    store = open_recordings([BAG], progress=False)
+
+
+@pytest.mark.parametrize('known', [False, True])
+def test_a_network_is_scored_as_the_predictor_that_it_becomes(bank, levels, known):
+    network = lively_network(num_context=3, image_size=64)
+    network.bank = levels if known else bank
+    store, chosen = open_recordings([BAG], progress=False), [1, 4, 7]
     as_network, as_predictor = (evaluate(asked, store, chosen)['prediction']
-                                for asked in (network, predictor))
+                                for asked in (network, SubgoalPredictor(network)))
     assert np.allclose(as_network.min_l1, as_predictor.min_l1, atol=0.002)
     assert np.allclose(as_network.object_mass, as_predictor.object_mass, atol=0.01)
+    assert np.allclose(as_network.bottleneck, as_predictor.bottleneck, atol=0.2)
 
 
 def test_recursion_puts_the_prediction_between_start_and_keyframe(network, bank, episodes):
@@ -114,8 +132,7 @@ def test_recursion_puts_the_prediction_between_start_and_keyframe(network, bank,
     assert earlier.distance == later.distance and not earlier.warning
 
 
-@pytest.fixture
-def copying(bank):
+def copies(bank):
     """Return a predictor that copies the keyframe, except for the left half: the start."""
     made = lively_network(num_context=3, image_size=64)
     made.bank = bank
@@ -133,6 +150,12 @@ def copying(bank):
         'settings': {'crop': 'centre', 'size': 64}, 'camera_size': [128, 128]})
 
 
+@pytest.fixture
+def copying(bank):
+    """Return such a predictor with a bank that knows nothing of objects."""
+    return copies(bank)
+
+
 def test_objects_are_where_start_and_goal_are_copied_from(copying, episodes):
     episode = episodes[0]
     pixels = np.array([[10, 20], [50, 30]])
@@ -140,6 +163,50 @@ def test_objects_are_where_start_and_goal_are_copied_from(copying, episodes):
     assert subgoal.mass == pytest.approx([1, 0])  # the second is copied from the keyframe
     assert np.allclose(subgoal.expected_pixels[0], pixels[0], atol=1e-3)
     assert np.allclose(subgoal.object_maps.sum((1, 2)), 1)
+
+
+def test_each_level_of_recursion_has_a_keyframe_and_objects_are_where_it_has_them(
+        levels, episodes, tmp_path):
+    assert len(levels) == 20 and levels.levels == 2 and len(levels.keyframes) == 40
+    episode = episodes[4]
+    start, goal = (full(episode, t) for t in (0, -1))
+    pixels = episode.object_pixels[[0, -1]] * 2 + 0.5  # in pictures of 128 px
+    alike = episodes[levels.find(np.stack([
+        resize_image(one, (64, 64)) for one in (start, goal)])[None])[0][0]]
+    of_start = pixels[0, ::-1]  # whatever their order: by where they begin
+    order = [int(np.linalg.norm(alike.object_pixels[0] * 2 - at, axis=1).argmin())
+             for at in of_start]
+    assert sorted(order) == [0, 1]
+    earlier, later, last = copies(levels).predict(
+        start, goal, of_start, pixels[1, ::-1], recursion_depth=3)[::-1]
+    for subgoal, t in ((earlier, 22), (later, 11), (last, 11)):  # beyond the last: that one again
+        assert (subgoal.image[:, 70:] == full(alike, t)[:, 70:]).all()
+        for at, k, mass in zip(subgoal.expected_pixels, order, subgoal.mass):
+            if alike.object_pixels[t, k, 0] > 33 and of_start[order.index(k), 0] > 70:
+                assert np.abs(at - alike.object_pixels[t, k] * 2 - 0.5).max() < 0.02
+                assert mass == pytest.approx(1)
+    made = lively_network(num_context=3, image_size=64)
+    made.bank = levels
+    save_weights(tmp_path / 'w', made, 'predictor', made.config, {})
+    again = load_network(tmp_path / 'w')[0].bank
+    assert again.levels == 2 and again.tensors().keys() == levels.tensors().keys()
+    assert all(again.tensors()[name].equal(tensor) for name, tensor in levels.tensors().items())
+
+
+def test_an_object_of_which_a_keyframe_knows_nothing_is_nowhere_in_it(episodes, ends):
+    places = np.stack([one.object_pixels[[0, 20]] for one in episodes]).astype(np.float32)
+    places[:, 1, 1] = np.nan
+    bank = KeyframeBank.choose(ends, lambda i: full(episodes[i], 20), places)
+    maps = torch.zeros(1, 2, 3, 64, 64)
+    asked = np.concatenate([places[7, 0], [[5, 5]]])
+    added = bank.beside_maps(maps, [asked], np.array([7]))[0, 2]
+    assert added.sum((1, 2)).tolist() == pytest.approx([1, 0, 0])
+    v, u = divmod(int(added[0].argmax()), 64)
+    assert np.abs(np.array([u, v]) - places[7, 1, 0]).max() <= 0.5
+    again = KeyframeBank.take(bank.tensors(), 'file')
+    assert again.beside_maps(maps, [asked], np.array([7])).equal(
+        bank.beside_maps(maps, [asked], np.array([7])))
+    assert all(tensor.isfinite().all() for tensor in bank.tensors().values())
 
 
 def test_the_keyframe_is_copied_at_its_full_size(copying, bank, episodes):
@@ -185,6 +252,16 @@ def test_hostile_banks_are_refused_in_one_line(network, tmp_path):
             ({'bank.keyframe.3': bomb}, 'are more than'),
             ({f'bank.keyframe.{n}': file.clone() for n in range(65)} | {
                 'bank.ends': ends[:1].expand(65, -1, -1, -1, -1).contiguous()}, 'expected 1 to'),
+            ({'bank.objects': torch.zeros(19, 2, 1, 2)}, 'places of at most'),
+            ({'bank.objects': torch.zeros(20, 3, 1, 2)}, 'places of at most'),
+            ({'bank.objects': torch.zeros(20, 2, 33, 2)}, 'places of at most'),
+            ({'bank.objects': torch.zeros(20, 2, 1, 3)}, 'places of at most'),
+            ({'bank.objects': torch.zeros(20, 2, 2)}, 'places of at most'),
+            ({'bank.objects': torch.full((20, 2, 1, 2), torch.inf)}, 'not finite'),
+            ({'bank.objects': torch.zeros(20, 2, 1, 2).double()}, 'places of at most'),
+            ({'bank.objects': torch.zeros(20, 2, 1, 2).bfloat16()}, 'ScalarType'),
+            ({f'bank.keyframe.{n}': file.clone() for n in range(20, 30)}, 'expected 1 to'),
+            ({f'bank.keyframe.{n}': file.clone() for n in range(180)}, 'expected 1 to'),
             ({name: None for name in tensors if name.startswith('bank.')}, 'without a bank')):
         wrong = {name: tensor for name, tensor in {**tensors, **changes}.items()
                  if tensor is not None}

@@ -93,3 +93,18 @@ def test_masks_choose_the_context_of_an_object_that_stays_where_it_was_if_all_av
     assert expected_pixels(warped.maps)[0].allclose(0.75 * start + 0.25 * goal, atol=1e-4)
     hidden = warp_object_maps(maps, away, masks_for([0.0, 0.0, 1.0]))
     assert expected_pixels(hidden.maps)[0].allclose((start + goal) / 2, atol=1e-4)
+
+
+def test_an_object_that_is_lost_is_where_a_keyframe_has_it_if_that_is_known():
+    start, goal, maps = start_and_goal()
+    there = torch.tensor([[12.0, 18.0]])
+    third = one_hot_maps(there, SIZE)[None, None]
+    away, masks = constant_flow(1000, 1000, contexts=3), masks_for([0.5, 0.25, 0.25])
+    known, unknown = (warp_object_maps(torch.cat([maps, one], 1), away, masks)
+                      for one in (third, 0 * third))
+    assert known.mass == unknown.mass == 0
+    assert expected_pixels(known.maps)[0].allclose(there, atol=1e-4)
+    assert expected_pixels(unknown.maps)[0].allclose((2 * start + goal) / 3, atol=1e-4)
+    copied = warp_object_maps(torch.cat([maps, third], 1), constant_flow(0, 0, contexts=3),
+                              masks_for([0.0, 0.9, 0.1]))
+    assert expected_pixels(copied.maps)[0].allclose(0.9 * goal + 0.1 * there, atol=1e-4)

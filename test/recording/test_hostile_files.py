@@ -546,7 +546,7 @@ def test_subtasks_are_written_into_the_set_alone(name, secret, tmp_path):
         write_subtasks(folder, *given)
     assert secret.read_bytes() == SECRET and contents(folder) == before
     (folder / f'{name}.part').unlink()
-    assert write_subtasks(folder, *given) == 6
+    assert write_subtasks(folder, *given) == (6, 0)
 
 
 @pytest.mark.parametrize('fps, rows, told, said', [

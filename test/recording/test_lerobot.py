@@ -100,7 +100,9 @@ def test_of_another_robot_pictures_and_signals_are_taken_and_the_rest_is_named(
     assert 'not taken: observation.images.wrist' in said
     told = ' '.join(str(one.message) for one in recwarn)
     assert '6 signals: ' in told and f'{ACTION} of episode 0' in told  # their shape is wrong
-    for new, old in zip(open_recordings(tmp_path / 'bag'), truth, strict=True):
+    found = open_recordings(tmp_path / 'bag')
+    assert not found.commands, 'nobody has sent commands of ours'
+    for new, old in zip(found, truth, strict=True):
         np.testing.assert_array_equal(new.frames, old.frames)
         assert not new.actions.any() and np.isnan(new.grippers).all() and not new.object_names
         assert new.signal_names == tuple(f'{STATE}/{name}' for name in 'abcd')

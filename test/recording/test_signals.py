@@ -86,8 +86,9 @@ def test_floats_of_records_are_signals(tmp_path, capsys):
                                             'steps/odd': [1.0] * 7}))
     for options, rows in ((), slice(None)), (('--rate', 2.5), slice(None, None, 2)):
         bag = tmp_path / f'bag{len(options)}'
-        assert not run_import(
-            capsys, 'import-tfrecord', tmp_path, '--camera', 'image_0', '--out', bag, *options)[0]
+        code, said = run_import(
+            capsys, 'import-tfrecord', tmp_path, '--camera', 'image_0', '--out', bag, *options)
+        assert code == 0 and 'signals: observation/state: 2 numbers\n' in said
         episode, = open_recordings(bag)
         assert episode.signal_names == ('observation/state/0', 'observation/state/1')
         np.testing.assert_array_equal(episode.signals, np.reshape(state, (6, 2))[rows])
@@ -110,8 +111,9 @@ def test_numbers_beside_arrays_of_pictures_are_signals(tmp_path, capsys):
         file['data/all'] = angles  # of no demonstration
         layout = h5py.VirtualLayout((6, 2), 'f8')
         file.create_virtual_dataset('data/demo_0/elsewhere', layout)
-    assert not run_import(capsys, 'import-arrays', tmp_path / 'in.h5', '--fps', 4, '--rate', 2,
-                          '--out', tmp_path / 'bag')[0]
+    code, said = run_import(capsys, 'import-arrays', tmp_path / 'in.h5', '--fps', 4, '--rate', 2,
+                            '--out', tmp_path / 'bag')
+    assert code == 0 and 'signals: actions, obs/joints: 4 numbers\n' in said
     for number, episode in enumerate(open_recordings(tmp_path / 'bag')):
         assert episode.signal_names == ('actions', *(f'obs/joints/{k}' for k in range(3)))
         np.testing.assert_allclose(episode.signals, np.concatenate(

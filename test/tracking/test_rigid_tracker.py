@@ -15,8 +15,8 @@ from tap_ros.base.errors import TrackingError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.plane import check_pose, TOP
+from tap_ros.tracking.proposals import propose
 from tap_ros.tracking.protocols import View
-from tap_ros.tracking.registration import propose
 
 SIZE = 256
 COLOURS = (((200, 60, 60), (60, 90, 200)), ((70, 170, 70), (220, 210, 80)))  # halves of objects
@@ -191,6 +191,17 @@ def test_what_moved_from_one_picture_to_another_is_proposed():
     found = propose(draw(STARTS, robot=(0, 0, 40, 60)), draw((STARTS[0], (120.0, 220.0))))
     assert len(found) == 1 and np.abs(found - STARTS[1:]).max() < 2
     assert propose(draw(STARTS), draw(STARTS)).shape == (0, 2)
+
+
+@pytest.mark.parametrize('goal', [((60.0, 200.0), (200.0, 60.0)), ((80.0, 100.0), (200.0, 60.0)),
+                                  ((150.0, 60.0), (80.0, 104.0))])
+def test_objects_that_touch_are_proposed_apart_where_they_move_apart(goal):
+    """Both move; one stays; one comes to where the other one was."""
+    starts = np.array(((80.0, 100.0), (80.0, 116.0)))
+    found = propose(draw(starts), draw(goal, (1.0, -1.0) if goal[0] != (80.0, 100.0) else (0, 1)))
+    moved = starts[np.linalg.norm(starts - goal, axis=1) > 0]
+    assert len(found) == len(moved)
+    assert np.linalg.norm(found[:, None] - moved, axis=-1).min(1).max() < 4
 
 
 @pytest.mark.parametrize('noise', [8, 16, 30])

@@ -4,17 +4,24 @@
 
 from dataclasses import replace
 
+from lively import lively_network
+from made_episodes import cover, write_bag
 import numpy as np
 import pytest
 from tap_ros.base.errors import ConfigError
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.protocol import Request
 from tap_ros.prediction.retrieval import ends_of, neighbours
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
+from tap_ros.training.batches import Pictures
+from tap_ros.training.frames import FilledStore
 from tap_ros.training.keyframes import Keyframes, NEIGHBOURS
-from tap_ros.training.predictor import train
+from tap_ros.training.marks import episode_preferences
+from tap_ros.training.objective import Networks, predictor_loss
+from tap_ros.training.predictor import draw_batch, train
 from tap_ros.training.predictor_config import TrainingConfig
 from tap_ros.weights.weights import load_weights
 
@@ -34,11 +41,11 @@ def config(bag, store, tmp_path):
         selection='marks', marks=str(tmp_path / 'marks.json'), keyframes=True)
 
 
-def test_what_is_drawn_is_the_label_of_another_demonstration_that_is_alike(store):
+def test_what_is_drawn_is_the_label_of_another_demonstration_that_is_alike(store, config):
     episodes = np.arange(2, len(store))
     labels = [int(n) // 2 for n in store.lengths]
     preference = [np.eye(int(n), dtype=np.float32)[[t]] for n, t in zip(store.lengths, labels)]
-    keyframes, rng = Keyframes(store, episodes, preference), np.random.default_rng(0)
+    keyframes, rng = Keyframes(store, episodes, preference, config), np.random.default_rng(0)
     near = neighbours(np.stack([
         ends_of(*store.frames(int(i))[[0, -1]]) for i in episodes]), NEIGHBOURS)[0]
     shown = {i: {store.frames(int(episodes[j]))[labels[episodes[j]]].tobytes() for j in near[n]}
@@ -67,8 +74,62 @@ def test_weights_hold_the_keyframes_of_the_training_and_answer_with_them(store, 
     assert subgoal.image.shape == frames[0].shape and subgoal.distance > 0
 
 
+def test_each_of_two_marks_has_its_keyframe_as_targets_show_it(store, config, tmp_path):
+    """With recursion, and where the robot is taken out of the pictures."""
+    bag = write_bag(tmp_path / 'covered', [cover(one, side=6, seed=0) for one in store])
+    store, config = open_recordings([bag], progress=False), replace(
+        config, recordings=(str(bag),), steps=2)
+    write_marks(config.marks, store, [bag], {
+        i: [(n // 3, n // 3), (2 * n // 3, 2 * n // 3)]
+        for i, n in enumerate(store.lengths[:10].tolist())})
+    config = replace(config, recursion=2, robot_mask='all', fill_context=1.0)
+    weights, everything = train(config, progress=False), np.arange(len(store))
+    preference, _ = episode_preferences(store, config, everything)
+    filled = FilledStore(store, 'all')
+    keyframes = Keyframes(store, everything, preference, config, filled)
+    bank = keyframes.bank()
+    assert bank.levels == 2 and len(bank) == len(store)
+    for i in range(10):
+        n = store.lengths[i]
+        for level, t in enumerate((2 * n // 3, n // 3), 1):
+            shown = bank.keyframes[bank.numbers(np.array([i]), level)[0]]
+            assert (shown == filled.frames(i)[t]).all()
+    assert any((filled.frames(i) != store.frames(i)).any() for i in range(10))
+    tensors = bank.tensors()
+    assert tensors['bank.objects'].shape == (len(store), 3, 2, 2)
+    np.testing.assert_array_equal(
+        tensors['bank.objects'][4, 1], store[4].object_pixels[2 * store.lengths[4] // 3])
+    assert (tensors['bank.ends'][4].numpy() == ends_of(*filled.frames(4)[[0, -1]])).all()
+    network, training = load_network(weights)
+    frames, pixels = store.frames(20), store[20].object_pixels
+    found = SubgoalPredictor(network, training).predict(
+        frames[0], frames[-1], pixels[0], pixels[-1], recursion_depth=2)
+    assert [subgoal.level for subgoal in found] == [2, 1]
+
+
+def test_each_level_is_trained_with_its_own_keyframe(store, config):
+    write_marks(config.marks, store, config.recordings, {
+        i: [(n // 3, n // 3), (2 * n // 3, 2 * n // 3)]
+        for i, n in enumerate(store.lengths[:10].tolist())})
+    config, everything = replace(config, recursion=2), np.arange(len(store))
+    preference, _ = episode_preferences(store, config, everything)
+    keyframes = Keyframes(store, everything, preference, config)
+    batch = draw_batch(store, everything, config, Pictures(
+        preference=preference, keyframes=keyframes), 0)
+    assert batch.context.shape[1] == 2 and batch.keyframes.shape[1] == 2
+    assert (batch.keyframes[:, 0] != batch.keyframes[:, 1]).any()
+    shown, network = [], lively_network(num_context=3, image_size=store.image_size[0])
+    network.register_forward_pre_hook(lambda _, given: shown.append(given[0]))
+    predictor_loss(Networks(network), batch, config)
+    augmented = batch.augmentation.apply(to_float(batch.keyframes))
+    assert len(shown) == 2
+    for level, given in enumerate(shown):
+        assert given.shape[1] == 3 and given[:, 2].equal(augmented[:, level])
+    assert shown[0][:, 0].equal(shown[1][:, 0]) and not shown[0][:, 1].equal(shown[1][:, 1])
+
+
 @pytest.mark.parametrize('values', [
-    {'new_pixels': True}, {'recursion': 2}, {'mode': 'forward'},
+    {'new_pixels': True}, {'recursion': 9}, {'mode': 'forward'},
     {'selection': 'relative', 'marks': ''}])
 def test_keyframes_go_with_marks_and_copying_alone(config, values):
     with pytest.raises(ConfigError, match='^keyframes'):

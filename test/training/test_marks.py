@@ -76,6 +76,8 @@ def test_marks_of_something_else_are_refused_with_the_file_and_the_reason(bag, s
             ({'stamps': [float('nan')]}, 'as seconds'), ('{', 'no file of marks')):
         assert said in refusal(data), data
     entry = {'recording': str(bag), 'episode': 0, 'stamps': [begin + 0.5]}
+    for names in ('grasp', ['grasp', 'grasp'], ['']):
+        assert '"names" are not usable' in refusal(json.dumps({'names': names, 'marks': [entry]}))
     assert 'marked above' in refusal(json.dumps({'marks': [entry, entry]}))
 
 
@@ -128,6 +130,20 @@ def test_the_likeliest_frames_are_those_about_the_label(bag, store, marks, tmp_p
     for one, other in zip(back, ahead):
         np.testing.assert_array_equal(one, other[::-1])
     assert back[0].argmax(1).tolist() == [3, 1]
+    # By its name one of them is trained on alone; labels are those of both together.
+    write_marks(marks, store, [bag], read_marks(marks, store).episodes, ('grasp', 'release'))
+    for name, row in (('grasp', 1), ('release', 0)):
+        alone, told = episode_preferences(store, replace(config, mark_name=name), everything)
+        assert len(told['marks']['levels']) == 1
+        for one, other in zip(alone, back):
+            np.testing.assert_array_equal(one, other[row:row + 1])
+    for values, said in (({'mark_name': 'lift'}, 'lift is none of the marks; .* grasp, release'),
+                         ({}, 'has 2, .* or choose one of grasp, release by --mark-name')):
+        with pytest.raises(ConfigError, match=said):
+            episode_preferences(store, replace(config, **values), everything)
+    for values in ({'recursion': 2}, {'marks': '', 'selection': 'relative'}):
+        with pytest.raises(ConfigError, match='^mark_name'):
+            replace(config, mark_name='grasp', **values).check()
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 from tap_ros import Predictor, SubgoalPredictor
 from tap_ros.__main__ import main
 from tap_ros.base import plugins
-from tap_ros.base.errors import ConfigError, WeightsError
+from tap_ros.base.errors import ConfigError, TapError, WeightsError
 from tap_ros.images.crop import trained_crop
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.nearest_keyframe import halfway, NearestKeyframe, recorded_places
@@ -117,6 +117,10 @@ def test_predictors_go_by_name_also_those_of_other_packages(bag, tmp_path, monke
         assert 'subgoal' in capsys.readouterr().out
     assert (load_predictor(f'nearest_keyframe:{marks}:{bag}').predict(*EPISODES[0].frames[:2])[0]
             .image == store[1].frames[2]).all()
+    assert load_predictor(f'nearest_keyframe:{bag}:size=32:crop=centre').image_size == (32, 32)
+    for told in ('gap=x', 'gap=nan', 'image_topic=/none'):
+        with pytest.raises(TapError, match='nearest_keyframe|gap|/none'):
+            load_predictor(f'nearest_keyframe:{bag}:{told}')
     for argument in (str(marks), f'{bag}:{marks}:{marks}'):
         with pytest.raises(ConfigError, match='at most one file of marks'):
             load_predictor(f'nearest_keyframe:{argument}')

@@ -26,6 +26,7 @@ from tap_ros.weights import PREDICTORS
 
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
+STEP_BUDGET = 80  # of a goal: more than by itself, since somebody watches who can cancel
 END_S = 6.0  # that a cancel may take when the node ends
 LARGEST = 1e6  # of a pixel
 UNDER_WAY = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
@@ -92,7 +93,8 @@ class ExplorerCalls:
     :param node: rclpy Node that another thread spins.
     :param display: that shows what happens.
     :param on_error: called with what went wrong for which nobody but us is to blame.
-    :ivar end: how the last goal of a browser ended, in words, and whether it was reached.
+    :ivar end: how the last goal of a browser ended, in words; whether it was reached, or stopped
+        because its steps were spent.
     """
 
     def __init__(self, node: Node, display: Display, on_error: Callable[[str], object]) -> None:
@@ -103,7 +105,7 @@ class ExplorerCalls:
         self._goal: Reaching | None = None
         self._asked = self._cancelled = self._ending = False  # asked: by a browser, for a goal
         self._stage = ''
-        self.end: dict[str, Any] = {'end': '', 'reached': False}
+        self.forget_end()
         self._under_way = False  # a goal, whoever sent it
         self._planner: Presence | None = None  # that said so
         node.create_subscription(GoalStatusArray, STATUS, self._on_status,
@@ -129,7 +131,7 @@ class ExplorerCalls:
 
     def forget_end(self) -> None:
         """Forget how the last goal ended: there is another one."""
-        self.end = {'end': '', 'reached': False}
+        self.end: dict[str, Any] = {'end': '', 'reached': False, 'spent': False}
 
     def do(self, text: str | bytes) -> None:
         """
@@ -181,7 +183,7 @@ class ExplorerCalls:
                 said = f'{REFUSED[do]}: {plain(text)}'
                 self._display.events.add(said, problem=True)
                 if do == 'reach':
-                    self.end = {'end': said, 'reached': False}
+                    self.end = {'end': said, 'reached': False, 'spent': False}
                 if isinstance(error, TapError):
                     self._node.get_logger().info(f'{do}: {text}')
                 else:
@@ -254,18 +256,18 @@ class ExplorerCalls:
         if cancelled:
             raise CallError(f'{words}: cancelled before it began')
         goal = self._client.reach(
-            mode=mode, on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
+            mode=mode, step_budget=STEP_BUDGET, on_feedback=self._on_feedback,
+            timeout_s=GOAL_TIMEOUT_S)
         with self._lock:
             self._goal, cancelled = goal, self._cancelled
         if cancelled:  # meanwhile
             goal.cancel()
         self._display.events.add(f'{words}: begun')
         result = goal.result()
-        end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
-        if result.end == 'succeeded' and not result.success:  # of its steps none is left
-            end += '; go again to come nearer'
+        end = 'cancelled' if result.end == 'cancelled' else plain(escaped(result.message, 1000))
         end = f'{words}: {end} ({result.steps} steps)'
-        self.end = {'end': end, 'reached': result.success}
+        spent = result.end == 'succeeded' and not result.success
+        self.end = {'end': end, 'reached': result.success, 'spent': spent}
         self._display.events.add(end)
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:

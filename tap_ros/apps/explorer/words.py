@@ -23,7 +23,8 @@ def plain(text: str) -> str:
     """Return a text of a node in which no topic or service is named where a word would do."""
     text = re.sub(r'^(?:service )?[\w/]*/\w+(?: refused)?: ', '', text)
     text = re.sub(r'; call \S*select_objects', '; click on them', text)
-    return re.sub(r'\bon (/[\w/]*\w)', lambda found: f'from {word(found[1])}', text)
+    return re.sub(r'\bon (/[\w/]*\w(?:, /[\w/]*\w)*)', lambda found: 'from ' + ', '.join(
+        map(word, found[1].split(', '))), text)
 
 
 def word(topic: str) -> str:

@@ -78,7 +78,7 @@ function draw() {
     button(names().length ? `${k + 1} ${name}` : name, () => mark(names().length ? k : null)), {className: k === free ? 'main' : ''}));
   const offer = proposed();
   $('accept').hidden = !offer.length || String(offer) === String(draft);
-  $('accept').textContent = `a accept ${offer.map(second).join(', ')}`;
+  $('accept').textContent = `accept ${offer.map(second).join(', ')} (a)`;
   fill($('list'), Object.entries(state.marks), ([i, frames]) => made('li', {className: Number(i) === episode ? 'here' : ''},
     button(`${i}: ${state.seconds[i].map((s) => `${s.toFixed(1)} s`).join(', ')}`, () => { visit(Number(i), frames[0]); })));
   if (!count) $('list').append(made('li', {className: 'soft'}, 'What you mark is listed here.'));

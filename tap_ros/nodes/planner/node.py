@@ -21,6 +21,7 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused
 from tap_ros.base.errors import ConfigError, PlanningError, TapError
 from tap_ros.base.text import escaped, listing
+from tap_ros.messages.objects import distance_in_words
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES, TWIST
 from tap_ros.nodes.planner import settings
@@ -283,7 +284,10 @@ class VisualMpcNode(LifecycleBase):
                 if answer.outcome == 'aborted':
                     raise PlanningError(answer.message)
                 self._distance.publish(Float64(data=reach.distance))
-                result.success, result.message = answer.outcome == 'reached', answer.message
+                far = distance_in_words(self._inputs.objects, self._goal.objects, reach.distance,
+                                        self._mpc.image_size[1])
+                result.success = answer.outcome == 'reached'
+                result.message = f'{answer.message}: {far}'
                 return
             if isinstance(answer, SelectTargets):
                 targets = self._goal.targets(

@@ -23,8 +23,10 @@ from tap_ros.messages.objects import decode_cut_objects, decode_states
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.planning.reach import Observation
+from tap_ros.robots.arm import get_arm
+from tap_ros.ros.arm_place import ArmPlace
 from tap_ros.ros.observations import JUMP_NS, Moment, Observations, reception_time
-from tap_ros.ros.parameters import declared_arm, Parameters
+from tap_ros.ros.parameters import Parameters
 from tap_ros.ros.robot_view import RobotView
 from tap_ros.ros.subscriptions import publishers_of, rivals
 from tap_ros.ros.topics import camera_topics, LATCHED, LOCK_STEP, of_topic, STREAM
@@ -46,7 +48,7 @@ class PlannerInputs:
     :ivar topics: short names of what is looked at, the joints last.
     :ivar sensors: Observations.
     :ivar robot: RobotView.
-    :ivar frame_id: of the picture that was seen last.
+    :ivar frame_id: of the picture that was seen last; objects: in it, as they came.
     """
 
     def __init__(self, node: Node, params: Parameters, crop: Callable[[], TrainedCrop],
@@ -59,7 +61,8 @@ class PlannerInputs:
         self._full = {key: node.resolve_topic_name(name) for key, name in self._names.items()}
         self.sensors = Observations(*types)
         self._gripper = GripperHistory(
-            declared_arm(params), params['joint_prefix'], params['fixed_opening'])
+            get_arm(params['arm']), params['joint_prefix'], params['fixed_opening'],
+            ArmPlace(node, params).mount)
         self._joints_error = ''  # why the joint states cannot be used
         self._camera_size: tuple[int, int] | None = None
         self._episode = 0, 0  # stamp of its beginning, and jumps of the clock until then
@@ -75,6 +78,7 @@ class PlannerInputs:
         self._since, self.frame_id = since, ''
         self._seen: Observation | None = None
         self._shown: np.ndarray | None = None  # its picture, of the camera's size
+        self.objects = ObjectStates()
         self._publishers = publishers_of(self._node, *self._names.values())
 
     def look(self) -> tuple[Observation | None, str]:
@@ -200,7 +204,7 @@ class PlannerInputs:
             order = [names.index(name) for name in self._seen.names]
             names, pixels = self._seen.names, pixels[order]
             states = tuple(states[k] for k in order) if states else ()
-        self._shown = picture
+        self._shown, self.objects = picture, messages['objects']
         return Observation(self.cut(picture, name), gripper, names, pixels, moment.stamp_ns,
                            states=states)
 

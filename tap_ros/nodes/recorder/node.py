@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool
-from tap_ros.base.errors import ConfigError, RecordingError, StorageError
+from tap_ros.base.errors import ConfigError, KinematicsError, RecordingError, StorageError
 from tap_ros.base.files import free_folder
 from tap_ros.base.text import escaped
 from tap_ros.messages.topics import (
@@ -27,9 +27,10 @@ from tap_ros.messages.topics import (
 from tap_ros.recording.file_writer import BagWriter
 from tap_ros.recording.messages import encode
 from tap_ros.recording.metadata import ArmMount, write_mount
+from tap_ros.ros.arm_place import ArmPlace
 from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
-from tap_ros.ros.parameters import declared_mount, Parameters, setting
+from tap_ros.ros.parameters import Parameters, setting
 from tap_ros.ros.polling import take_messages
 from tap_ros.ros.subscriptions import AdaptiveSubscription, steady_timer
 from tap_ros.ros.topics import camera_image, message_class, SERVICE_QOS
@@ -45,13 +46,15 @@ class Bags:
     :param params: Parameters of the node.
     :param report: called with the text of every failure.
     :param period: full name of the topic that says of what unit the commands are.
+    :param place: where the arm stands.
     :ivar failure: why the last bag is missing or incomplete, None if it is not.
     :ivar count: messages in the last bag.
     """
 
     def __init__(self, params: Parameters, report: Callable[[str], object],
-                 period: str) -> None:
+                 period: str, place: ArmPlace) -> None:
         self._params, self._report, self._period = params, report, period
+        self._place, self._stands = place, ArmMount()
         self._writer: BagWriter | None = None
         self._last: dict[str, tuple[str, bytes, Qos]] = {}  # of latched topics
         self._unflushed = False
@@ -73,6 +76,7 @@ class Bags:
         if self._writer is not None:
             return self._writer.folder
         self.failure, self.count = 'the recording could not be begun', 0  # until it is
+        self._stands = ArmMount()
         folder = free_folder(self._params['folder'])
         self._writer = BagWriter(folder, compression=self._params['compression'])
         self.failure = None
@@ -85,11 +89,8 @@ class Bags:
                 self._write(topic, type_name, data, qos, now, now)
             except RecordingError as error:  # of this topic alone
                 self._report(f'{escaped(topic)}: a message was not recorded: {escaped(error)}')
-        arm = ArmMount(
-            declared_mount(self._params), self._params['fixed_opening'], self._params['arm'])
         try:
-            if arm != ArmMount():  # which readers assume
-                write_mount(folder, arm)
+            self._write_mount(folder)
         except StorageError as error:
             self._give_up(error)
         self._unflushed = True
@@ -112,6 +113,18 @@ class Bags:
             self._last[topic] = type_name, data, qos
         self._write(topic, type_name, data, qos, received_ns, sent_ns)
 
+    def _write_mount(self, folder: Path) -> None:
+        """Write where the arm stands, unless that is what readers assume or was written."""
+        try:
+            mount = self._place.usual()
+        except KinematicsError as error:
+            self._report(f'where the arm stands is not recorded: {error}')
+            return
+        arm = ArmMount(mount, self._params['fixed_opening'], self._params['arm'])
+        if arm != self._stands:
+            write_mount(folder, arm)
+            self._stands = arm
+
     def flush(self) -> None:
         """Write buffered messages to the disk."""
         if self._writer is not None and self._unflushed:
@@ -127,6 +140,7 @@ class Bags:
             return self.failure or 'nothing was being recorded'
         writer, self._writer = self._writer, None
         try:
+            self._write_mount(writer.folder)  # by now tf_static may have told it
             writer.close()
         except Exception as error:
             return self._fail(
@@ -192,7 +206,7 @@ class RecorderNode(Node):
             expected=self._wanted if self.params['topics'] != [*BY_NAME] else ())
         if period not in map(self.resolve_topic_name, self._wanted):
             self._wanted = [*self._wanted, period]  # what the arm tells goes before the parameter
-        self._bags = Bags(self.params, self._report, period)
+        self._bags = Bags(self.params, self._report, period, ArmPlace(self, self.params))
         if self.params['record_on_start']:
             self._bags.start()
         self._subscribe_known()
@@ -302,6 +316,6 @@ def declare_parameters(node: Node) -> Parameters:
     parameters = Parameters(node)
     parameters.declare_fields(RecorderParameters)
     parameters.declare('topics', list(BY_NAME), 'Topics to record.')
-    parameters.declare_shared('image_transport', 'control_period')
+    parameters.declare_shared('image_transport', 'control_period', 'joint_prefix')
     parameters.declare_arm()
     return parameters

@@ -19,10 +19,11 @@ from tap_ros.base.text import escaped
 from tap_ros.messages.images import decode_camera_info
 from tap_ros.messages.joints import JointHistory
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount, TIP_FRAME
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
 from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
+from tap_ros.ros.arm_place import ArmPlace
 from tap_ros.ros.calls import log_error
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.frames import FixedFrames
@@ -54,7 +55,8 @@ class RobotMaskNode(Node):
         self.params = declare_parameters(self)
         self._light = declared_light(self.params)
         self._camera = self.params.camera_pose()  # at the base itself there is none: as tf tells
-        self._frames = FixedFrames(self) if not self._camera[:3, 3].any() else None
+        self._frames = FixedFrames(self)
+        self._place = ArmPlace(self, self.params, self._frames)
         # CameraInfo of pictures that have no mask yet, and when they were received.
         self._waiting: deque[tuple[CameraInfo, float]] = deque(maxlen=WAITING)
         self._robot: Robot | None = None
@@ -66,7 +68,8 @@ class RobotMaskNode(Node):
             AdaptiveSubscription(self, JointState, 'joint_states', self._on_joints, STREAM),
             AdaptiveSubscription(
                 self, CameraInfo, 'camera/camera_info', self._on_camera_info, STREAM)]
-        robot = named_robot(self.params)
+        self._stands = declared_mount(self.params)  # of a named arm
+        robot = named_robot(self.params, self._stands)
         if robot is not None:
             self._use(robot)
         else:
@@ -142,7 +145,13 @@ class RobotMaskNode(Node):
         :raises KinematicsError: when robot or joints are not known for its time.
         :raises ImageError: for a camera that cannot be used.
         """
-        begin, robot = time.perf_counter(), self._robot
+        begin = time.perf_counter()
+        if self.params['urdf'] in names('tap_ros.arms') and (
+                stands := self._place.usual()) != self._stands and (
+                named := named_robot(self.params, stands)):
+            self._use(named)
+            self._stands = stands
+        robot = self._robot
         cameras = rivals(publishers_of(self, 'camera/camera_info'))
         if cameras:
             raise ImageError(f'{cameras}; leave one of them')
@@ -164,7 +173,7 @@ class RobotMaskNode(Node):
 
     def _camera_in_base(self, frame: str) -> np.ndarray:
         """Return the pose (4, 4) of a camera, by parameters or tf; ImageError without any."""
-        if self._frames is None:
+        if self._camera[:3, 3].any():
             return self._camera
         pose = self._frames.pose(frame, self._base)
         if pose is None:
@@ -227,10 +236,11 @@ def declare_parameters(node: Node) -> Parameters:
     return parameters
 
 
-def named_robot(parameters: Parameters) -> Robot | None:
+def named_robot(parameters: Parameters, mount: Mount) -> Robot | None:
     """
     Return the robot that the parameter urdf names, None where it comes as a message.
 
+    :param mount: of an arm that is named.
     :raises ConfigError: when the file cannot be used.
     """
     urdf = parameters['urdf']
@@ -238,7 +248,7 @@ def named_robot(parameters: Parameters) -> Robot | None:
         return None
     if urdf in names('tap_ros.arms'):
         text = robot_description(
-            get_arm(urdf), declared_mount(parameters), parameters['hand_radius'])
+            get_arm(urdf), mount, parameters['hand_radius'])
         return read_urdf(text, urdf)
     path = Path(urdf)
     try:

@@ -21,11 +21,13 @@ from tap_ros.messages.images import decode_camera_info, decode_image, decode_mas
 from tap_ros.messages.joints import GripperHistory
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE, JOINT_STATES
+from tap_ros.robots.arm import get_arm
 from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.ros.arm_place import ArmPlace
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.frames import FixedFrames
 from tap_ros.ros.observations import JUMP_NS, Moment, Observations, reception_time
-from tap_ros.ros.parameters import declared_arm, Parameters, pose_matrix
+from tap_ros.ros.parameters import Parameters, pose_matrix
 from tap_ros.ros.subscriptions import adapt_regularly, AdaptiveSubscription, publishers_of
 from tap_ros.ros.topics import camera_topics, goal_topics, LATCHED, STREAM
 from tap_ros.tracking.plane import check_pose, Plane
@@ -55,7 +57,8 @@ class TrackerInputs:
         self._frames = FixedFrames(node)
         self.episode = 0, 0  # stamp at which the newest known of began; jumps until then
         self._gripper = GripperHistory(
-            declared_arm(params), params['joint_prefix'], params['fixed_opening'])
+            get_arm(params['arm']), params['joint_prefix'], params['fixed_opening'],
+            ArmPlace(node, params, self._frames).mount)
         camera, goal = camera_topics(params), goal_topics(params['robot_mask'])
         del camera['objects'], goal['objects']
         self._topics, self._image_topic = tuple(camera), camera['image'][1]

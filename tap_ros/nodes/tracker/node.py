@@ -14,7 +14,7 @@ import numpy as np
 from rclpy.node import Node
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import SelectObjects
-from tap_ros.base.contract import HIDDEN, LOST, SEEN, WORLD_FRAME
+from tap_ros.base.contract import HIDDEN, LOST, object_names, SEEN, WORLD_FRAME
 from tap_ros.base.errors import TapError, TrackingError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.base.text import escaped, listing
@@ -30,8 +30,8 @@ from tap_ros.ros.parameters import CameraParameters, Parameters, setting
 from tap_ros.ros.subscriptions import Publishers, rivals
 from tap_ros.ros.topics import encode_objects, LATCHED, SERVICE_QOS, STREAM
 from tap_ros.tracking.plane import MIDDLE, Plane
+from tap_ros.tracking.proposals import propose
 from tap_ros.tracking.protocols import Tracked, Tracker, View
-from tap_ros.tracking.registration import propose
 
 MOVED = 2.0  # px of the working picture by which the table has moved in that of another camera
 
@@ -105,7 +105,7 @@ class TrackerNode(Node):
             plane, camera = self._inputs.calibration(view.image.shape[:2])
             if request.propose:
                 tracked = self._propose(view, camera)
-                found = [f'object_{k + 1}' for k in range(len(tracked.pixels))]
+                found = list(object_names(len(tracked.pixels)))
                 response.message = f'{len(found)} things differ in the goal picture'
             else:
                 found, tracked, response.message = self._select(
@@ -171,7 +171,7 @@ class TrackerNode(Node):
                 'goal picture nothing can be proposed')
         tracker: Tracker = self._make(camera)
         found = []
-        for pixel in propose(view, self._inputs.goal_view(goal, view.image.shape[:2])):
+        for pixel in propose(view, self._inputs.goal_view(goal, view.image.shape[:2]), camera):
             with suppress(TrackingError):  # it could not be followed
                 tracker.select(view, [pixel])
                 found.append(pixel)

@@ -36,6 +36,7 @@ from tap_ros.recording.formats.pictures import (
     find_files,
     make_episode,
     Options,
+    print_signals,
     signal_fields,
     Skipped,
     write_bag,
@@ -59,7 +60,7 @@ def run(args: Options) -> None:
     import h5py
     while h5py.h5pl.size():  # a plug-in for an array is code
         h5py.h5pl.remove(0)
-    skipped, others = Skipped(), other_cameras(args.camera)
+    skipped, others, kept = Skipped(), other_cameras(args.camera), dict[str, None]()
     files = find_files(args.paths, ('*.hdf5', '*.h5'), skipped)
 
     def show(each: Any) -> np.ndarray:
@@ -85,15 +86,17 @@ def run(args: Options) -> None:
                                                     f'episode {number}')
                             rows = np.rint(times * (args.fps or FPS)).astype(int)
                             own = _demonstration(name)
+                            fields = _signals(beside.get(own, {}), rows, budget, skipped)
+                            kept.update(dict.fromkeys(fields.get('signal_names', ())))
                             yield make_episode(
-                                frames, times, task=args.task, seed=number,
-                                **_signals(beside.get(own, {}), rows, budget, skipped)), {
+                                frames, times, task=args.task, seed=number, **fields), {
                                 topic: others[topic].view(
                                     those[own], rows, show, skipped, f'episode {number}')
                                 for topic, those in beside_it.items() if own in those}
 
     print(write_bag(args, episodes(), skipped))
     print_views(others)
+    print_signals(kept)
 
 
 def _chosen(arrays: Collection[str], camera: str = '') -> list[str]:

@@ -22,6 +22,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from tap_ros.base.errors import ConfigError, RecordingError
+from tap_ros.base.options import check_different
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.recording.cache import open_recordings
@@ -51,6 +52,7 @@ from tap_ros.recording.formats.pictures import (
     DAMAGE,
     decoded,
     make_episode,
+    print_signals,
     Skipped,
     Target,
     write_bag,
@@ -100,8 +102,7 @@ def run(args: Options) -> None:
             i: [(t, t) for t in frames] for i, frames in enumerate(data.marks) if frames})
         print(f'{escaped(path)}: marks where the next subtask begins, of '
               f'{sum(map(bool, data.marks))} episodes')
-    if data.signals:
-        print(f'signals: {listing(data.signals)}: {sum(map(len, data.signals.values()))} numbers')
+    print_signals(data.signals, sum(map(len, data.signals.values())))
     if data.unused:
         print(f'not taken: {listing(data.unused)}')
 
@@ -150,7 +151,8 @@ class DataSet:
         self.marks: list[list[int]] = []
         self.rows = self._read_rows(count)
         colour = [name for name in colour if not self._is_deep(name)]
-        keys = list(dict.fromkeys(chosen))
+        check_different('--camera', chosen)
+        keys = list(chosen)
         if not cameras.keys() >= {*keys} or not keys and len(colour) != 1:
             raise ConfigError(f'{escaped(self.folder)}: --camera: expected one of '
                               f'{listing(colour or cameras) or "its cameras, but there are none"}')

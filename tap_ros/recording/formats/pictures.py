@@ -8,7 +8,7 @@ another meaning.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from tap_ros.base.errors import ConfigError, ImageError, RecordingError, RecordingWarning
 from tap_ros.base.files import only_writer
-from tap_ros.base.options import default_text, Folder
+from tap_ros.base.options import check_different, default_text, Folder
 from tap_ros.base.progress import Progress
 from tap_ros.base.text import escaped, listing
 from tap_ros.images.crop import Crop
@@ -96,8 +96,9 @@ class Options(Target):
     task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
 
     def __post_init__(self) -> None:
-        """Refuse rates that no camera has."""
+        """Refuse rates that no camera has, and a camera that is given twice."""
         super().__post_init__()
+        check_different('--camera', self.camera)
         if not 0 <= self.fps <= 1000:
             raise ConfigError(f'--fps {self.fps}: expected more than 0, to 1000, or 0')
 
@@ -232,7 +233,7 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
     :param frames: T pictures, uint8 (H, W, 3).
     :param seconds: (T,), when they were taken, increasing.
     :param object_names: of K objects, whose pixels are known.
-    :param known: other fields of Episode; what is left out is unknown, actions are zeros.
+    :param known: other fields of Episode; what is left out is unknown, and not recorded.
     :return: Episode.
     :raises ValueError: for times and a seed that a recording cannot hold.
     """
@@ -245,8 +246,10 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
         raise ValueError(f'its seed {escaped(known["seed"], 30)} is none: 0 to 2^64 - 1')
     known['task'] = known.get('task', '').encode(errors='replace').decode()[:MOST_CHARACTERS]
     unknown = np.full((T, K, 7), np.nan)
+    none = np.full((T, 4), np.nan, np.float32)
+    none[-1] = 0  # nothing leads on from the last frame
     fields = {
-        'actions': np.zeros((T, 4), np.float32), 'grippers': np.full((T, 4), np.nan, np.float32),
+        'actions': none, 'grippers': np.full((T, 4), np.nan, np.float32),
         'object_pixels': np.full((T, K, 2), np.nan, np.float32), 'object_poses': unknown,
         'goal_frame': None, 'goal_pixels': np.full((K, 2), np.nan, np.float32),
         'goal_poses': np.full((K, 7), np.nan), 'object_source': 'imported'}
@@ -264,6 +267,17 @@ def signal_fields(found: Mapping[str, np.ndarray]) -> dict[str, Any]:
     with np.errstate(over='ignore'):  # absurd numbers become infinite
         signals = np.concatenate([*found.values()], 1, dtype=float, casting='unsafe')
         return {'signal_names': tuple(names), 'signals': signals.astype(np.float32)}
+
+
+def print_signals(names: Collection[str], count: int = 0) -> None:
+    """
+    Print which numbers beside the pictures are kept as signals, if any.
+
+    :param names: of arrays of so many numbers in all; or of each number, see signal_fields.
+    """
+    if names:
+        arrays = names if count else dict.fromkeys(re.sub(r'/\d+$', '', name) for name in names)
+        print(f'signals: {listing(arrays)}: {count or len(names)} numbers')
 
 
 def _is_free(folder: Path) -> bool:

@@ -37,6 +37,7 @@ from tap_ros.recording.formats.pictures import (
     find_files,
     make_episode,
     Options,
+    print_signals,
     signal_fields,
     Skipped,
     write_bag,
@@ -56,7 +57,7 @@ def run(args: Options) -> None:
     :raises TapError: for records that cannot be read, and a folder that holds something.
     """
     camera, others = next(iter(args.camera), ''), other_cameras(args.camera)
-    blank, skipped = Counter[bool](), Skipped()
+    blank, skipped, kept = Counter[bool](), Skipped(), dict[str, None]()
     files = find_files(args.paths, ('*.tfrecord*',), skipped)
     for name in _missing(file for file in files if file not in set(map(Path, args.paths))):
         skipped.note('it is not there; fetch it, then import again', 'file', name)
@@ -83,15 +84,17 @@ def run(args: Options) -> None:
                     said = features.get('steps/language_instruction') or [args.task.encode()]
                     if not is_blank:
                         rows = np.rint(times * (args.fps or FPS)).astype(int)
+                        fields = _signals(floats, len(pictures), rows)
+                        kept.update(dict.fromkeys(fields.get('signal_names', ())))
                         yield make_episode(
-                            list(map(args.cut.image, frames)), times,
-                            **_signals(floats, len(pictures), rows),
+                            list(map(args.cut.image, frames)), times, **fields,
                             task=said[0].decode(errors='replace'), seed=number), {
                             topic: one.view(partial(_of, features, one.key), rows, show, skipped,
                                             f'record {place}') for topic, one in others.items()}
 
     print(f'{write_bag(args, episodes(), skipped)} of {escaped(camera)}')
     print_views(others)
+    print_signals(kept)
     if blank[True]:
         print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
 

@@ -5,6 +5,7 @@
 // The connection, and the steps that lead from a scene to an arm that moves.
 
 const RECONNECT_MS = 1000;
+const LONG = 70;  // letters of an event that need a wide place
 const STEPS = ['scene', 'objects', 'goal', 'predict', 'go'];
 const VIEW = {scene: 'camera', objects: 'camera', goal: 'goal', predict: 'goal', go: 'subgoal'};  // which a step begins with
 
@@ -124,6 +125,8 @@ function showState() {
   allow('predict', busy || done.predict[2]);
   allow('direct', busy || done.go[2], 'to the goal at once');
   allow('subgoal-run', busy || done.go[2] || done.predict[2], 'first to a predicted subgoal');
+  $('subgoal-run').textContent = `go ${run.spent ? 'on ' : ''}via subgoal`;
+  $('direct').textContent = `go ${run.spent ? 'on ' : ''}direct`;
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
   $('propose').hidden = $('follow').hidden = !selecting();
@@ -186,7 +189,7 @@ function hint() {
 
 function showEvents() {
   if (!events.length) return;
-  fill($('log'), [...events].reverse(), ({text, time, picture, problem}) => made('li', {className: picture ? '' : 'wide', title: text},
+  fill($('log'), [...events].reverse(), ({text, time, picture, problem}) => made('li', {className: picture && text.length < LONG ? '' : 'wide', title: text},
     ...picture ? [made('img', {src: picture, alt: ''})] : [],
     made('time', {textContent: new Date(1000 * time).toLocaleTimeString()}),
     made('div', {className: problem ? 'bad' : '', textContent: text})));

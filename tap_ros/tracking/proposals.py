@@ -1,0 +1,157 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Objects without a click: what a goal picture shows elsewhere, and what moves together is one."""
+
+from collections.abc import Iterator, Sequence
+
+import cv2
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.tracking.picture import FEW, Palette, Picture
+from tap_ros.tracking.plane import Plane
+from tap_ros.tracking.protocols import View
+from tap_ros.tracking.registration import change, LEAST_SURE, locate
+from tap_ros.tracking.silhouette import (
+    centre,
+    COMMON,
+    Cut,
+    LEAST_CONTRAST,
+    LIKELY,
+    SHARED,
+    silhouette,
+    top_face,
+)
+from tap_ros.tracking.template import Matcher, Pose, Template
+
+LEAST_CHANGED = 60  # px of the working picture
+MOST_TRIED = 32  # changes, the largest ones, where an object may have been
+SHADE = 0.04  # apart in shares of red, green and blue, below which it is one colour
+WHOLE = 0.85  # fit in the goal picture of what is one object
+LEAST_PIECE = 0.15  # share of what was cut out, of an object in it
+NEAR = 0.03  # m, by which the gap of two pieces of one object may change
+SEEMS = 1.4  # factor by which it may seem to, beside that, where the camera is not known
+MOVED = 0.3  # share of a piece in what has changed, without which it stands where it stood
+_SQUARE = np.ones((3, 3), np.uint8)
+
+
+def propose(start: View, goal: View, camera: PinholeCamera | None = None) -> np.ndarray:
+    """
+    Find objects without a click: what one picture shows and the other one does not.
+
+    :param start: the picture in which the objects are wanted; goal: another of the same camera.
+    :param camera: in the frame of the table, where it is known.
+    :return: (N, 2) pixels of the start picture, the largest object first.
+    """
+    plane = Plane(camera, start.image.shape[:2])
+    before, after = Picture(start, plane), Picture(goal, plane)
+    found: list[np.ndarray] = []
+    parts = list(_changed_objects(before, after))
+    while parts and len(found) < MOST_TRIED:
+        part = parts.pop(0)
+        cut = silhouette(before, _deepest(part))
+        if cut.contrast > LEAST_CONTRAST:
+            found += [mask for mask in _apart(before, after, plane, part, cut) if all(
+                (mask & other).sum() < SHARED * mask.sum() for other in found)]
+            rest = part & ~(cv2.dilate(cut.mask.astype(np.uint8), _SQUARE) > 0)
+            parts = [*_parts(rest), *parts]
+    found.sort(key=lambda mask: -int(mask.sum()))
+    return plane.enlarge(np.reshape([_middle(mask) for mask in found], (-1, 2)))
+
+
+def _changed_objects(before: Picture, after: Picture) -> Iterator[np.ndarray]:
+    """
+    Yield parts (h, w) bool of a picture that have changed, or may have, and are no table.
+
+    What the robot hides in the other picture may have. Colours of the table are those around.
+    """
+    may = change(before, after) | after.hidden & ~before.hidden
+    for region in _parts(may)[:MOST_TRIED]:
+        beside = (cv2.dilate(region.astype(np.uint8), np.ones((15, 15), np.uint8)) > may
+                  ) & ~before.hidden
+        if beside.any():
+            table = Palette(before.lab[beside], least=COMMON)
+            yield from _parts(region & (table.distance(before.index) > LIKELY))
+
+
+def _apart(before: Picture, after: Picture, plane: Plane, part: np.ndarray,
+           cut: Cut) -> list[np.ndarray]:
+    """Return the objects (h, w) bool in a cut around a part that has changed."""
+    whole = [cut.mask]
+    (pose,) = _located(before, after, plane, cut, whole)
+    if pose is not None and pose.fit > WHOLE and (
+            np.linalg.norm(pose.place - plane.of_top(centre(cut.mask))) > NEAR):
+        return whole
+    pieces = _pieces(before, cut.mask)
+    groups: list[list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = []
+    for piece, pose in zip(pieces, _located(before, after, plane, cut, pieces)):
+        if pose is None:
+            continue
+        known = piece, plane.of_top(centre(piece)), pose.place
+        for group in groups:
+            if all(_kept(known[1] - here, known[2] - there, plane) for _, here, there in group):
+                group.append(known)
+                break
+        else:
+            groups.append([known])
+    masks = [np.logical_or.reduce([piece for piece, _, _ in group]) for group in groups]
+    masks = [mask for mask in masks if mask.sum() > LEAST_PIECE * cut.mask.sum()]
+    moved = [mask for mask in masks if (mask & part).sum() > MOVED * mask.sum()]
+    return moved if len(masks) > 1 and moved else whole
+
+
+def _pieces(picture: Picture, mask: np.ndarray) -> list[np.ndarray]:
+    """Return the parts of a mask (h, w) bool that have one colour each, whatever its shades."""
+    colours = cv2.GaussianBlur(picture.image, (3, 3), 0.7)[mask].astype(np.float32) + 1
+    colours /= colours.sum(1, keepdims=True)
+    cv2.setRNGSeed(0)
+    _, labels, found = cv2.kmeans(
+        colours, min(FEW, len(colours)), np.zeros((len(colours), 1), np.int32), (3, 15, 1e-3), 2,
+        cv2.KMEANS_PP_CENTERS)
+    centres = np.asarray(found)
+    _, kinds = connected_components(np.linalg.norm(centres[:, None] - centres, axis=-1) < SHADE)
+    shown = np.full(mask.shape, -1)
+    shown[mask] = kinds[np.ravel(labels)]
+    return [part for kind in np.unique(kinds) for part in _parts(shown == kind)]
+
+
+def _located(before: Picture, after: Picture, plane: Plane, cut: Cut,
+             masks: Sequence[np.ndarray]) -> list[Pose | None]:
+    """Return where each mask of a picture is in another one; None where it is not."""
+    matcher, shown, found = Matcher(after.by(cut.metric), plane), before.by(cut.metric), []
+    for mask in masks:
+        place = plane.of_top(centre(mask))
+        template = Template(shown, plane, mask, place, face=top_face(mask, plane))
+        pose = locate(matcher, template, extra=[place])
+        found.append(pose if pose is not None and pose.confidence > LEAST_SURE else None)
+    return found
+
+
+def _kept(before: np.ndarray, after: np.ndarray, plane: Plane) -> bool:
+    """Tell whether two pieces are as far apart as before; without calibration as it seems."""
+    first, second = float(np.linalg.norm(before)), float(np.linalg.norm(after))
+    factor = 1.0 if plane.calibrated else SEEMS
+    return first / factor - NEAR < second < first * factor + NEAR
+
+
+def _parts(mask: np.ndarray) -> list[np.ndarray]:
+    """Return the connected parts of a mask (h, w) that are not too small, the largest first."""
+    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _SQUARE)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    areas = stats[:, cv2.CC_STAT_AREA]
+    areas[0] = 0
+    return [labels == i for i in np.argsort(-areas) if areas[i] >= LEAST_CHANGED]
+
+
+def _deepest(mask: np.ndarray) -> np.ndarray:
+    """Return the pixel (2,) of a mask (h, w) farthest from all that is not in it."""
+    depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 3)
+    v, u = np.unravel_index(depth.argmax(), depth.shape)
+    return np.array([u - 1.0, v - 1.0])
+
+
+def _middle(mask: np.ndarray) -> np.ndarray:
+    """Return the middle (2,) of a mask (h, w), or where that is not in it its deepest pixel."""
+    at = centre(mask)
+    u, v = np.rint(at).astype(int)
+    return at if mask[v, u] else _deepest(mask)
