@@ -13,6 +13,7 @@ from tap_ros.ros.frames import FixedFrames
 from tap_ros.ros.parameters import declared_mount, MOUNT, Parameters
 
 APART, TURNED = 0.01, math.radians(1)  # m, rad, up to which two tell the same
+NEAR_MIDDLE = 0.2  # m from the table's middle, where no base stands
 
 
 class ArmPlace:
@@ -26,7 +27,9 @@ class ArmPlace:
     def __init__(self, node: Node, params: Parameters, frames: FixedFrames | None = None) -> None:
         self._node, self._params = node, params
         self._logged = ''  # what was wrong
-        self._typed = not params.given.isdisjoint(MOUNT)
+        self._missing = [name for name in MOUNT if name not in params.given]
+        self._typed = len(self._missing) < len(MOUNT)
+        self._first: Mount | None = None  # that tf_static told
         self._frames = frames or FixedFrames(node)
         self._frame = params['mount_frame'] or f'{params["joint_prefix"]}{BASE_FRAME}'
 
@@ -34,11 +37,14 @@ class ArmPlace:
         """
         Return the Mount, None where neither parameters nor tf_static tell it.
 
-        :raises KinematicsError: where they contradict each other, or the base does not stand
-            upright.
+        :raises KinematicsError: where they contradict each other, or tf_static itself; where some
+            parameters are missing; where the base is tilted, or in the middle of the table.
         """
         typed, pose = declared_mount(self._params), self._frames.pose(self._frame, WORLD_FRAME)
         if pose is None:
+            if self._typed and self._missing:
+                raise KinematicsError(f'{", ".join(self._missing)}: not set, but other parameters '
+                                      'of the mount are; set all four, or none')
             return typed if self._typed else None
         x, y, z = pose[:3, 3].tolist()
         found = Mount((x, y, z), math.atan2(pose[1, 0], pose[0, 0]), typed.tool)
@@ -47,12 +53,18 @@ class ArmPlace:
             tilt = math.degrees(math.acos(max(pose[2, 2], -1.0)))
             raise KinematicsError(f'{where}, and tilted by {tilt:.0f} degrees; the base has to '
                                   'stand upright there')
-        if math.dist(found.position, typed.position) <= APART and (
-                abs(math.remainder(found.yaw - typed.yaw, math.tau)) <= TURNED):
+        if math.hypot(x, y) < NEAR_MIDDLE:
+            raise KinematicsError(f'{where}, in the middle of the table; {WORLD_FRAME} is the '
+                                  "table's middle here, and a robot's own frame in its driver")
+        self._first = self._first or found
+        if not _same(found, self._first):
+            raise KinematicsError(f'{where}, and before at {_words(self._first)}; restart the '
+                                  'node if the arm was moved')
+        if _same(found, typed):
             return typed
         if self._typed:
             raise KinematicsError(f'{where}, but by mount_x to mount_turn at {_words(typed)}; '
-                                  'leave these parameters out, or correct one of both')
+                                  'correct one of both')
         return found
 
     def mount(self) -> Mount:
@@ -78,6 +90,11 @@ class ArmPlace:
     def usual(self) -> Mount:
         """Return the Mount, that of the simulated table where nothing tells it; else as told."""
         return self.told() or declared_mount(self._params)
+
+
+def _same(one: Mount, other: Mount) -> bool:
+    return math.dist(one.position, other.position) <= APART and (
+        abs(math.remainder(one.yaw - other.yaw, math.tau)) <= TURNED)
 
 
 def _words(mount: Mount) -> str:

@@ -38,9 +38,15 @@ BEGIN, PERIOD, DRIVER = 10**10, 250 * MS, 40 * MS  # ns: of the pictures, of the
 COUNT, SIZE = 5, (48, 64)
 ARM = get_arm(DEFAULT_ARM)
 PARAMS = {
-    'joint_prefix': '', 'fixed_opening': 0.0, 'max_silence': 0.35, 'arm': DEFAULT_ARM,
+    'joint_prefix': '', 'mount_frame': '', 'fixed_opening': 0.0, 'max_silence': 0.35, 'arm': DEFAULT_ARM,
     'mount_turn': ARM.mount.yaw, 'tool_length': ARM.mount.tool,
     **{f'mount_{axis}': value for axis, value in zip('xyz', ARM.mount.position)}}
+
+
+class Given(dict):
+    """Parameters of which all were given."""
+
+    given = frozenset(PARAMS)
 
 
 def pixels_of(t):
@@ -132,8 +138,8 @@ def traffic(picture, joints):
 
 def seen_live(node, other, crop, sent, compressed, robot_mask):
     """Publish messages; return {stamp: (Observation of the planner, Request to the predictor)}."""
-    params = PARAMS | {'image_transport': 'compressed' if compressed else 'raw',
-                       'robot_mask': robot_mask}
+    params = Given(PARAMS | {'image_transport': 'compressed' if compressed else 'raw',
+                            'robot_mask': robot_mask})
     planner = PlannerInputs(node, params, lambda: crop, lambda name: None)
     reader = RequestReader(node, params, lambda name: None)
     predictor = SimpleNamespace(camera_crop=crop, mode='bidirectional', full_size=True)

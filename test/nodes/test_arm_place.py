@@ -4,6 +4,7 @@
 
 from contextlib import suppress
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,10 +15,11 @@ from tap_ros.base.errors import KinematicsError
 from tap_ros.nodes.robot_mask.node import RobotMaskNode
 from tap_ros.robots.ur10e import UR10E
 from tap_ros.ros.arm_place import ArmPlace
-from tap_ros.ros.parameters import Parameters
+from tap_ros.ros.parameters import MOUNT, Parameters
 from tap_ros.ros.topics import encode_camera_info, encode_joints, to_stamp
 from test_frames import told
 from test_robot_mask_node import CAMERA
+import yaml
 
 TABLE = (0.0, 0.7, -0.1)  # of the simulated arm, turned to the right
 
@@ -66,9 +68,10 @@ def test_parameters_that_were_given_or_else_tf_static_say_where_it_stands(standi
     found = node.place.mount()
     assert found.position == (0.5, -0.25, 0.02) and found.tool == 0.15
     assert found.yaw == pytest.approx(2.0)
-    node.tell((*TABLE[:2], -0.099), turned(-math.pi / 2 + 2 * math.pi))
-    assert node.place.mount().position == TABLE, 'to the bit, where they agree'
-    assert standing(mount_x=0.2, mount_turn=1.0).place.mount().position == (0.2, 0.7, -0.1)
+    typed = standing(**dict(zip(MOUNT, (*TABLE, -math.pi / 2))))
+    assert typed.place.mount().position == TABLE
+    typed.tell((*TABLE[:2], -0.099), turned(-math.pi / 2 + 2 * math.pi))
+    assert typed.place.mount().position == TABLE, 'to the bit, where they agree'
     left = standing(joint_prefix='left_')
     left.tell((1.0, 0.0, 0.0), turned(0.0))
     assert left.place.told() is None
@@ -84,12 +87,36 @@ def test_parameters_that_were_given_or_else_tf_static_say_where_it_stands(standi
     (TABLE, turned(0.0), r'turned by 0\.000 rad, but.*turned by -1\.571 rad'),
     (TABLE, turned(0.5, 'x'), 'tilted by 29 degrees')])
 def test_what_disagrees_is_refused_and_logged_once(standing, capfd, at, turn, words):
-    node = standing(mount_y=0.7)
+    node = standing(**dict(zip(MOUNT, (*TABLE, -math.pi / 2))))
     node.tell(at, turn)
     for _ in range(3):
         with pytest.raises(KinematicsError, match=words):
             node.place.mount()
     assert capfd.readouterr().err.count('by tf_static base is in world at') == 1
+
+
+def test_a_place_that_cannot_be_or_changes_or_is_told_in_part_is_refused(standing):
+    node = standing()
+    node.tell((0.0, 0.0, 0.0), turned(math.pi))  # as a driver whose world is the robot's
+    with pytest.raises(KinematicsError, match='in the middle of the table; world is'):
+        node.place.mount()
+    node.tell(TABLE, turned(-math.pi / 2))
+    assert node.place.mount().position == TABLE
+    node.tell((0.5, 0.6, 0.0), turned(-math.pi / 2))
+    with pytest.raises(KinematicsError, match=r'0\.500, 0\.600.*before at \(0\.000, 0\.700'):
+        node.place.mount()
+    with pytest.raises(KinematicsError, match='^mount_turn: not set'):
+        standing(mount_x=0.2, mount_y=0.7, mount_z=0.0).place.mount()
+
+
+def test_the_shipped_file_does_not_say_where_an_arm_stands(standing):
+    shipped = yaml.safe_load((Path(__file__).parents[2] / 'config/tap_ros.yaml').read_text())
+    for values in shipped.values():
+        own = {key: value for key, value in values['ros__parameters'].items()
+               if key in ('arm', 'tool_length', 'mount_frame', 'joint_prefix', *MOUNT)}
+        if 'tool_length' in own:
+            with pytest.raises(KinematicsError, match='nothing tells where the arm stands'):
+                standing(**own).place.mount()
 
 
 def test_the_mask_of_a_named_arm_is_where_tf_static_says_that_it_stands():
@@ -99,9 +126,8 @@ def test_the_mask_of_a_named_arm_is_where_tf_static_says_that_it_stands():
         camera = encode_camera_info(np.array([[64., 0, 32], [0, 64, 32], [0, 0, 1]]), (64, 64),
                                     to_stamp(10**9), 'eye')
         angles = UR10E.joints_at([0.0, 0.0, 0.1])
-        for x in (0.0, 0.2):
-            node._frames._take(SimpleNamespace(transforms=[told(
-                'world', 'base', (x, *TABLE[1:]), turned(-math.pi / 2))]))
+        for transforms in ([], [told('world', 'base', (0.2, *TABLE[1:]), turned(-math.pi / 2))]):
+            node._frames._take(SimpleNamespace(transforms=transforms))
             with suppress(KinematicsError):  # joints are told again to the arm that is elsewhere
                 node._mask(camera)
             for second in (0.9, 1.1):

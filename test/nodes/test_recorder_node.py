@@ -151,7 +151,8 @@ def test_topics_of_any_type_can_be_recorded_beside_where_the_arm_stands_and_its_
     robot = client.create_publisher(String, 'robot_description', LATCHED)
     robot.publish(String(data='<robot/>'))  # before the recorder is there
     node = record(topics=['elsewhere/joints', 'robot_description'], compression='none',
-                  mount_x=0.25, fixed_opening=0.5, control_period=0.5)
+                  mount_x=0.25, mount_y=0.7, mount_z=-0.1, mount_turn=UR10E.mount.yaw,
+                  fixed_opening=0.5, control_period=0.5)
     assert until(joints.get_subscription_count)
     joints.publish(JointState(name=['a'], position=[1.5]))
     arrived(joints, robot)

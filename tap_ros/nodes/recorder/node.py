@@ -30,7 +30,7 @@ from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.ros.arm_place import ArmPlace
 from tap_ros.ros.calls import answering
 from tap_ros.ros.diagnostics import Diagnostics
-from tap_ros.ros.parameters import Parameters, setting
+from tap_ros.ros.parameters import declared_mount, Parameters, setting
 from tap_ros.ros.polling import take_messages
 from tap_ros.ros.subscriptions import AdaptiveSubscription, steady_timer
 from tap_ros.ros.topics import camera_image, message_class, SERVICE_QOS
@@ -118,8 +118,8 @@ class Bags:
         try:
             mount = self._place.usual()
         except KinematicsError as error:
-            self._report(f'where the arm stands is not recorded: {error}')
-            return
+            mount = declared_mount(self._params)
+            self._report(f'the arm is recorded where mount_x to mount_turn say: {error}')
         arm = ArmMount(mount, self._params['fixed_opening'], self._params['arm'])
         if arm != self._stands:
             write_mount(folder, arm)
@@ -140,8 +140,8 @@ class Bags:
             return self.failure or 'nothing was being recorded'
         writer, self._writer = self._writer, None
         try:
-            self._write_mount(writer.folder)  # by now tf_static may have told it
             writer.close()
+            self._write_mount(writer.folder)  # by now tf_static may have told it
         except Exception as error:
             return self._fail(
                 f'{escaped(writer.folder)}: the bag could not be finished: {escaped(error)}; what '
