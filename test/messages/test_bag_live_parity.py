@@ -38,7 +38,8 @@ BEGIN, PERIOD, DRIVER = 10**10, 250 * MS, 40 * MS  # ns: of the pictures, of the
 COUNT, SIZE = 5, (48, 64)
 ARM = get_arm(DEFAULT_ARM)
 PARAMS = {
-    'joint_prefix': '', 'mount_frame': '', 'fixed_opening': 0.0, 'max_silence': 0.35, 'arm': DEFAULT_ARM,
+    'joint_prefix': '', 'mount_frame': '', 'fixed_opening': 0.0, 'max_silence': 0.35,
+    'arm': DEFAULT_ARM,
     'mount_turn': ARM.mount.yaw, 'tool_length': ARM.mount.tool,
     **{f'mount_{axis}': value for axis, value in zip('xyz', ARM.mount.position)}}
 
