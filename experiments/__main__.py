@@ -93,7 +93,7 @@ def _bench_start():
 
 
 def _bench_busy():
-    from experiments.bench.busy import Options, run
+    from experiments.bench.nodes.busy import Options, run
     return Command(Options, run)
 
 

@@ -15,7 +15,7 @@ from tap_ros.base.files import write_atomically
 import torch
 
 PARTS = ('collect', 'recording', 'growth', 'training', 'planning', 'nodes.service', 'nodes.start',
-         'busy')
+         'nodes.busy')
 
 
 @dataclass(frozen=True)
