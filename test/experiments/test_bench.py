@@ -6,7 +6,7 @@ import mmap
 import os
 from pathlib import Path
 
-from experiments.bench import busy, growth, recording
+from experiments.bench import growth, recording
 from experiments.bench.mppi import mppi
 from experiments.bench.rows import Row, show
 import numpy as np
@@ -47,7 +47,9 @@ def test_a_recording_larger_than_the_memory_is_inspected(tmp_path):
         growth.measure(['inspect', str(tmp_path / 'bag')], tmp_path / 'new', limit // 4)
 
 
+@pytest.mark.ros
 def test_work_is_done_in_turns_alone_and_beside_others():
+    from experiments.bench.nodes import busy
     found = []
 
     def children():
