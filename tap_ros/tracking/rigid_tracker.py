@@ -79,7 +79,13 @@ class RigidTracker:
 
     def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray,
                drawn: Sequence[np.ndarray] = ()) -> Tracked:
-        """Follow other objects, from this picture on, see Tracker."""
+        """
+        Follow these objects from this picture on, in place of those before.
+
+        :param pixels: (K, 2), a click on each object; drawn: K outlines (N, 2), or ().
+        :return: each at the middle of its silhouette.
+        :raises TrackingError: for a click on nothing; then those before are followed on.
+        """
         plane = Plane(self._camera, view.image.shape[:2])
         picture = Picture(view, plane)
         clicks = plane.shrink(np.reshape(pixels, (-1, 2)))
@@ -109,7 +115,7 @@ class RigidTracker:
         return _Object(place, [first], top, first, angle, sure=sure, part=not cut.whole)
 
     def update(self, view: View) -> Tracked:
-        """Follow into the next picture, see Tracker."""
+        """Return where the K objects are in the next picture."""
         if not self._objects:
             return self._tracked()
         picture = Picture(view, self._plane, self._first)
@@ -121,7 +127,7 @@ class RigidTracker:
         return self._tracked()
 
     def find(self, view: View) -> Tracked:
-        """Find the objects in another picture, see Tracker."""
+        """Return where they are in another picture, such as that of a goal; LOST: nowhere."""
         return register(self._first, Picture(view, self._plane, self._first),
                         [one.face for one in self._objects])
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tap_ros.base.contract import MOST_LEVELS
 from tap_ros.base.errors import ConfigError
-from tap_ros.base.options import Folder
+from tap_ros.base.options import check_different, Folder
 from tap_ros.images.robot_mask import RobotMask
 from tap_ros.recording.reading import Topics
 from tap_ros.training.run_config import RunConfig
@@ -181,6 +181,7 @@ class TrainingConfig(RunConfig):
         if self.marks and (self.min_crop < 1 or self.start_crop):
             raise ConfigError('marks: start and goal are drawn around the label; leave min_crop '
                               'and start_crop out, which draw them anywhere')
+        check_different('label_topic', (*self.cameras, *self.label_topic))
         if (self.label_topic or self.label_signals) and not self.marks:
             raise ConfigError('label_topic, label_signals: they tell the moment of marks; give '
                               '--marks')

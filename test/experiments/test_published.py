@@ -89,7 +89,8 @@ def intervals_in(page):
     'README', 'prediction', 'planning', 'stacking')])
 def test_every_interval_on_a_page_stands_in_the_data(page):
     found = intervals_in(ROOT / page)
-    known = intervals_in(RESULTS / 'worlds_loop.md')  # made from its own data
+    known = set().union(*(intervals_in(RESULTS / f'{name}.md')  # made from their own data
+                          for name in ('worlds_loop', 'tracking')))
     wide = json.loads((RESULTS / 'wide.json').read_text())['runs']
     for name, factor, digits in (('min_l1', 1, 4), ('bottleneck_2px', 100, 0)):
         known |= {tuple(f'{factor * bound:.{digits}f}' for bound in (
