@@ -29,7 +29,7 @@ class GymWorld(OneCamera, ABC):
     :ivar task_name: what the environment is about.
     :ivar object_names: of its K objects.
     :ivar camera: that takes its pictures.
-    :ivar slides: whether its first object can be pushed about.
+    :ivar slides: whether what `route` begins with can be pushed about.
     :ivar ways: places (x, y), m, by which that has to be pushed to its goal, for who demonstrates.
     """
 
@@ -94,7 +94,11 @@ class GymWorld(OneCamera, ABC):
         return self.observe()
 
     def route(self) -> Route:
-        """Return which object goes where, one after the other: by the ways, then to the goal."""
+        """
+        Return which object goes where, one after the other.
+
+        The first one, by the ways, to its goal; a world that pushes several overrides it.
+        """
         return [*((0, np.array(way)) for way in self.ways), (0, self.goal_places()[0, :2])]
 
     def step(self, action: ArrayLike) -> Observation:
@@ -133,7 +137,7 @@ class GymWorld(OneCamera, ABC):
         return replace(self._goal, stamp_ns=0)
 
     def demonstrate(self, seed: int, num_frames: int = 0, pushes: str = 'goal') -> Demonstration:
-        """Push the first object, to the 'goal' or at 'random', as pushes.py says."""
+        """Push the objects of `route`, to the 'goal' or at 'random', as pushes.py says."""
         return demonstrate_pushes(self, pushes, seed)
 
     def distances(self) -> np.ndarray:

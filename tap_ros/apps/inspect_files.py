@@ -55,7 +55,7 @@ def run(args: Options) -> None:
         from tap_ros.weights.weights import load_tensors
         tensors, about = load_tensors(args.path)
         if bank := KeyframeBank.take(tensors, args.path):
-            about['recorded_pictures'] = len(bank)  # frames of demonstrations, to be copied from
+            about['recorded_pictures'] = len(bank.keyframes)  # of demonstrations, to be copied
         print(json.dumps(about, indent=2))
         return
     bags = find_bags(args.path)

@@ -35,7 +35,8 @@ import torch
 
 MOST = 64  # demonstrations
 MOST_OBJECTS = 32  # whose places are kept
-NOWHERE = -1e6  # px; in a file: unknown
+FARTHEST = 1e6  # px from the picture's corner that a known place may be
+NOWHERE = -FARTHEST  # in a file: unknown
 MOST_BYTES = 2**28  # of all of them together, as rgb
 _PREFIX = 'bank.'
 _ENDS, _KEYFRAME, _OBJECTS = f'{_PREFIX}ends', f'{_PREFIX}keyframe.', f'{_PREFIX}objects'
@@ -50,7 +51,8 @@ class KeyframeBank:
         recursion.
     :param objects: float32 (N, 1 + L, K, 2), (u, v) of objects in the start and the keyframes, in
         pixels of the network; NaN where unknown. None: nothing is known.
-    :raises ConfigError: for none, too many, or as many of one as not of the others.
+    :raises ConfigError: for none, too many, or as many of one as not of the others, and for
+        places beyond FARTHEST.
     :raises ImageError: for pictures that are damaged, too large together, or differ in size.
     :ivar keyframes: N * L pictures uint8 (H, W, 3), at the recorded size.
     :ivar levels: L.
@@ -69,6 +71,8 @@ class KeyframeBank:
                 or objects.shape[:2] != (N, 1 + self.levels)
                 or objects.shape[2] > MOST_OBJECTS):
             raise ConfigError(f'expected places of at most {MOST_OBJECTS} objects in each')
+        if objects is not None and np.abs(np.nan_to_num(objects)).max(initial=0) > FARTHEST:
+            raise ConfigError(f'expected places of objects of at most {FARTHEST:.0f} pixels')
         self._ends, self._files, self._objects = ends, files, objects
         self.keyframes = [decompress(file, 'png', MOST_BYTES // len(files)) for file in files]
         if len({picture.shape for picture in self.keyframes}) > 1:

@@ -102,10 +102,10 @@ def make_message(message_type: type[M], fields: Mapping[str, Any]) -> M:
 def _filled(message: M, fields: Mapping[str, Any]) -> M:
     """Set fields of a message; return it."""
     for name, value in fields.items():
-        if isinstance(value, dict):
+        if isinstance(value, Mapping):
             _filled(getattr(message, name), value)
             continue
-        if isinstance(value, list) and value and isinstance(value[0], dict):
+        if isinstance(value, list) and value and isinstance(value[0], Mapping):
             kind = message.get_fields_and_field_types()[name]  # type: ignore[attr-defined]
             package, kind = kind.removeprefix('sequence<').removesuffix('>').split('/')
             value = [make_message(message_class(f'{package}/msg/{kind}'), one) for one in value]

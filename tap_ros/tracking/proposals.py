@@ -26,6 +26,7 @@ from tap_ros.tracking.template import Matcher, Pose, Template
 
 LEAST_CHANGED = 60  # px of the working picture
 MOST_TRIED = 32  # changes, the largest ones, where an object may have been
+MOST_CUTS = 4 * MOST_TRIED  # with what is left of a change beside what was cut out
 SHADE = 0.04  # apart in shares of red, green and blue, below which it is one colour
 WHOLE = 0.85  # fit in the goal picture of what is one object
 LEAST_PIECE = 0.15  # share of what was cut out, of an object in it
@@ -47,14 +48,17 @@ def propose(start: View, goal: View, camera: PinholeCamera | None = None) -> np.
     before, after = Picture(start, plane), Picture(goal, plane)
     found: list[np.ndarray] = []
     parts = list(_changed_objects(before, after))
-    while parts and len(found) < MOST_TRIED:
+    for _ in range(MOST_CUTS):
+        if not parts or len(found) >= MOST_TRIED:
+            break
         part = parts.pop(0)
         cut = silhouette(before, _deepest(part))
         if cut.contrast > LEAST_CONTRAST:
             found += [mask for mask in _apart(before, after, plane, part, cut) if all(
                 (mask & other).sum() < SHARED * mask.sum() for other in found)]
             rest = part & ~(cv2.dilate(cut.mask.astype(np.uint8), _SQUARE) > 0)
-            parts = [*_parts(rest), *parts]
+            if rest.sum() < part.sum():  # else the cut missed it, and would again
+                parts = [*_parts(rest), *parts]
     found.sort(key=lambda mask: -int(mask.sum()))
     return plane.enlarge(np.reshape([_middle(mask) for mask in found], (-1, 2)))
 

@@ -110,6 +110,7 @@ def test_objects_survive_the_round_trip_and_are_matched_by_name():
     ([(0.1, 0, 0.03), (0, 0, 0.03)], [(0.1, 0.04, 0.03), (0.01, 0, 0.03)], '2.5 cm from'),
     ([(0.1, 0, 0.03)], [(np.nan, 0, 0.03)], '3.1% of the picture from'),
     ([(0.1, 0, 0.03)], [(0, 0, 0)], '3.1% of the picture from'),  # nobody has filled it in
+    ([(0.1, 0, 0.03)], [(1e300, 0, 0.03)], '3.1% of the picture from'),
     ([(0.1, 0, 0.03)], [], '3.1% of the picture from'), ([], [], '3.1% of the picture from')])
 def test_distances_are_told_in_cm_or_where_positions_are_unknown_in_per_cent(here, there, words):
     def message(places):
@@ -118,6 +119,9 @@ def test_distances_are_told_in_cm_or_where_positions_are_unknown_in_per_cent(her
             [f'object_{k}' for k in range(len(places))], np.zeros((len(places), 2)), poses,
             to_stamp(0), 'world', ObjectStates.SOURCE_TRACKED)
     assert words in objects.distance_in_words(message(here), message(there), 2.0, 64)
+    elsewhere = message(there)
+    elsewhere.header.frame_id = 'camera'
+    assert '3.1% of' in objects.distance_in_words(message(here), elsewhere, 2.0, 64)
 
 
 @pytest.mark.parametrize('pixels, names, words', [

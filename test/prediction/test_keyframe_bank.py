@@ -258,6 +258,7 @@ def test_hostile_banks_are_refused_in_one_line(network, tmp_path):
             ({'bank.objects': torch.zeros(20, 2, 1, 3)}, 'places of at most'),
             ({'bank.objects': torch.zeros(20, 2, 2)}, 'places of at most'),
             ({'bank.objects': torch.full((20, 2, 1, 2), torch.inf)}, 'not finite'),
+            ({'bank.objects': torch.full((20, 2, 1, 2), 1e30)}, 'at most 1000000 pixels'),
             ({'bank.objects': torch.zeros(20, 2, 1, 2).double()}, 'places of at most'),
             ({'bank.objects': torch.zeros(20, 2, 1, 2).bfloat16()}, 'ScalarType'),
             ({f'bank.keyframe.{n}': file.clone() for n in range(20, 30)}, 'expected 1 to'),

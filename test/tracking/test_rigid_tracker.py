@@ -14,9 +14,11 @@ from tap_ros.base.contract import HIDDEN, LOST, SEEN, UNSURE
 from tap_ros.base.errors import TrackingError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.tracking import proposals
 from tap_ros.tracking.plane import check_pose, TOP
 from tap_ros.tracking.proposals import propose
 from tap_ros.tracking.protocols import View
+from tap_ros.tracking.silhouette import silhouette
 
 SIZE = 256
 COLOURS = (((200, 60, 60), (60, 90, 200)), ((70, 170, 70), (220, 210, 80)))  # halves of objects
@@ -191,6 +193,18 @@ def test_what_moved_from_one_picture_to_another_is_proposed():
     found = propose(draw(STARTS, robot=(0, 0, 40, 60)), draw((STARTS[0], (120.0, 220.0))))
     assert len(found) == 1 and np.abs(found - STARTS[1:]).max() < 2
     assert propose(draw(STARTS), draw(STARTS)).shape == (0, 2)
+
+
+def test_cuts_that_miss_their_change_are_not_tried_for_ever(monkeypatch):
+    tries = []
+
+    def beside(picture, at):
+        tries.append(at)
+        cut = silhouette(picture, at)
+        return replace(cut, mask=np.roll(cut.mask, len(cut.mask) // 2, 0), contrast=0.0)
+    monkeypatch.setattr(proposals, 'silhouette', beside)
+    propose(draw(STARTS), draw((STARTS[0], (120.0, 220.0))))
+    assert 0 < len(tries) <= proposals.MOST_TRIED
 
 
 @pytest.mark.parametrize('goal', [((60.0, 200.0), (200.0, 60.0)), ((80.0, 100.0), (200.0, 60.0)),
