@@ -82,7 +82,7 @@ def run(args: Options) -> None:
     store, reading = _open(args, training, crop)
     robot_mask = trained_robot_mask(training)[0]
     learned, episodes = _split(store, training, args.all, robot_mask)
-    marks = _read_marks(args.marks, store, episodes)
+    marks = _read_marks(args.marks, store, episodes, training)
     filled = None if robot_mask == 'none' else FilledStore(store, robot_mask)
 
     scores = evaluate(network, store, episodes, args.goal_picture, filled,
@@ -96,7 +96,8 @@ def run(args: Options) -> None:
         seen = evaluate(network, store, learned[:max(len(episodes), _SEEN)], args.goal_picture,
                         filled)['prediction']
     words = verdict(scores['prediction'], seen, *(
-        ['all episodes, also those trained on'] if args.all or not training else []))
+        ['all episodes, also those trained on'] if args.all else
+        [] if training else ['scored episodes']))
     if seen is None and not args.all:
         words.append('training episodes: they are not among these recordings, so nothing tells '
                      'whether they were memorised')
@@ -165,9 +166,16 @@ def _split(store: EpisodeStore, training: dict[str, Any], everything: bool,
     return learned, episodes
 
 
-def _read_marks(path: str, store: EpisodeStore, episodes: np.ndarray) -> Marks | None:
-    """Return the marks of a file, of some of these episodes at least; None without a file."""
+def _read_marks(path: str, store: EpisodeStore, episodes: np.ndarray,
+                training: dict[str, Any]) -> Marks | None:
+    """
+    Return the marks of a file, of some of these episodes at least; None without a file.
+
+    :return: of weights that were trained on the marks of one name, those alone.
+    """
     marks = read_marks(path, store) if path else None
+    if marks and (name := training.get('settings', {}).get('mark_name')):
+        marks = marks.named(name)
     if marks and marks.episodes.keys().isdisjoint(episodes.tolist()):
         raise ConfigError(
             'marks: none of the episodes that are scored is marked; mark some of them now, after '

@@ -9,6 +9,7 @@ import threading
 from typing import Any
 
 from tap_ros.apps.mark_labels import BackgroundLabels
+from tap_ros.base.contract import MOST_LEVELS
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import listing
 from tap_ros.recording.cache import EpisodeStore
@@ -116,11 +117,15 @@ class Marking:
         count = len(next(iter(marks.values())))
         height, width = self.store.camera_size or (1, 1)
         crop = [] if '--crop' in options or height == width else ['--crop', 'centre']
-        how = ['--recursion', str(count)] * (count > 1) + ['--keyframes', '--no-new-pixels']
+        how = [] if count == 1 else ['--recursion', str(count)]
+        if count > MOST_LEVELS:  # one of them can be trained on, if it has a name
+            how = ['--mark-name', *self.names[:1]]
+        how += ['--keyframes', '--no-new-pixels']
         return [shlex.join(['python', '-m', 'tap_ros', *words]) for words in (
             ['label', *both, *_without(options, '--crop'), '--out', f'labels/{name}'],
             ['train', 'predictor', *both, *options, *crop, '--size', '64', *how,
-             '--test-fraction', '0.25', '--threads', '1', '--out', f'runs/{name}'])]
+             '--test-fraction', '0.25', '--threads', '1', '--out', f'runs/{name}'])
+            if words[0] == 'label' or count <= MOST_LEVELS or self.names]
 
     @property
     def _enough(self) -> int:

@@ -17,18 +17,18 @@ Before "marks" there may be the names of an episode's marks: "names": ["grasp", 
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import hashlib
 import json
 from math import isfinite
 import os
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, Self, TYPE_CHECKING
 
 import numpy as np
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.files import write_atomically
-from tap_ros.base.text import escaped
+from tap_ros.base.text import escaped, listing
 from tap_ros.recording.trust import parse_json, read_bytes
 
 if TYPE_CHECKING:
@@ -51,6 +51,28 @@ class Marks:
     episodes: Mapping[int, Sequence[Mark]]
     digest: str
     names: tuple[str, ...] = ()
+
+    def number(self, name: str, episodes: Iterable[int]) -> int:
+        """
+        Return the number, from 0, of the marks of a name.
+
+        :raises ConfigError: if there is no such name, or one of the episodes has not as many
+            marks as there are names.
+        """
+        if name not in self.names:
+            raise ConfigError(f'mark_name: {escaped(name, 60)} is none of the marks; expected ' + (
+                f'one of {listing(self.names)}' if self.names else 'marks that have names'))
+        for i in episodes:
+            if len(self.episodes[i]) != len(self.names):
+                raise ConfigError(f'marks: demonstration {i} has {len(self.episodes[i])}, not as '
+                                  f'many as the names {listing(self.names)}; mark it again')
+        return self.names.index(name)
+
+    def named(self, name: str) -> Self:
+        """Return the marks of one name alone; ConfigError as number, of all episodes."""
+        k = self.number(name, self.episodes)
+        return replace(self, names=(name,),
+                       episodes={i: those[k:k + 1] for i, those in self.episodes.items()})
 
 
 def beside(recording: str | Path) -> Path:
@@ -76,7 +98,7 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
                 isinstance(name, str) and name for name in names) or len({*names}) < len(names):
             raise ConfigError(f'{name}: "names" are not usable; expected a list of different ones,'
                               ' such as ["grasp", "release"]')
-        if not all(isinstance(one[0], str) and isinstance(one[1], int) for one in found):
+        if not all(isinstance(one[0], str) and type(one[1]) is int for one in found):
             raise TypeError
     except OSError as error:
         raise ConfigError(
@@ -105,7 +127,7 @@ def _episode(store: 'EpisodeStore', folder: Path, recording: str, episode: int) 
     if not inside:
         raise ValueError('the recording is none of those that are read; name one by its path from '
                          f'{escaped(folder)}, or give it, too')
-    if isinstance(episode, bool) or not 0 <= episode < len(inside):
+    if not 0 <= episode < len(inside):
         raise ValueError(f'there is no such episode; expected 0 to {len(inside) - 1}')
     return inside[episode]
 

@@ -43,16 +43,17 @@ def command_units(parts: Sequence[Columns], tracks: Mapping[str, Track], gaps: n
         if len(rows):
             doubt = (f'nothing of {NAME} can be read; commands count as m/s for '
                      f'{CONTROL_PERIOD:g} s each')
-    told = np.append(first, told)
-    changes = np.flatnonzero(np.diff(told))
-    if len(changes) and len(rows):
-        at = changes[0]
-        doubt = (f'{NAME} changes {len(changes)} times, first from {told[at]:g} to '
-                 f'{told[at + 1]:g} s; a command lasts for what was told last. If a second '
-                 'planner told it, record without that one')
+    # What no command uses does not count: an arm's own value may replace the recorder's at once.
+    used = np.append(first, told)[np.searchsorted(period.log, twist.log[rows], 'right')]
+    changes = np.flatnonzero(np.diff(used))
+    if len(changes):
+        at, times = changes[0], f'{len(changes)} times' if len(changes) > 1 else 'once'
+        doubt = (f'{NAME} changes {times}, first from {used[at]:g} to {used[at + 1]:g} s; a '
+                 'command lasts for what was told last. If a second planner told it, record '
+                 'without that one')
     if doubt:
         warnings.warn(f'{parts[0].source}: {doubt}', RecordingWarning, stacklevel=4)
-    return told[np.searchsorted(period.log, twist.log[rows], 'right')][:, None]
+    return used[:, None]
 
 
 def last_told(parts: Sequence[Columns], before: float | None) -> float | None:

@@ -9,7 +9,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from tap_ros.base.errors import ConfigError
-from tap_ros.base.text import escaped, listing
+from tap_ros.base.text import listing
 from tap_ros.images.robot_mask import hidden_pixels, RobotMask
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import Mark, Marks, read_marks
@@ -83,10 +83,9 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
     if not chosen:
         raise ConfigError(f'marks: none of the {len(marks.episodes)} marked demonstrations is '
                           'trained on; mark some of those that are not held out')
-    if config.mark_name and config.mark_name not in marks.names:
-        raise ConfigError(
-            f'mark_name: {escaped(config.mark_name, 60)} is none of the marks; expected '
-            + (f'one of {listing(marks.names)}' if marks.names else 'marks that have names'))
+    order = slice(None) if config.forward else slice(None, None, -1)
+    if config.mark_name:
+        order = slice(k := marks.number(config.mark_name, chosen), k + 1)
     count = len(marks.names) if config.mark_name else config.recursion
     for i in chosen:
         if len(marks.episodes[i]) != count:
@@ -106,9 +105,6 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
         for first, last in marks.episodes[i]]) / 1e9 for i in chosen}
     of_chosen = [one for i in chosen if (one := films[i])]
     model, left_out = fit(of_chosen, list(moments.values()))
-    order = slice(None) if config.forward else slice(None, None, -1)
-    if config.mark_name:
-        order = slice(k := marks.names.index(config.mark_name), k + 1)
     about = [_worth(of_chosen, np.array(true), np.array(guess)) for true, guess in zip(
         np.transpose(list(moments.values())),
         np.transpose(left_out) if left_out else [()] * count)][order]

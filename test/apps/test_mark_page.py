@@ -239,6 +239,11 @@ def test_the_page_names_the_commands_that_come_next(bag, store, tmp_path, monkey
     words = one.commands(['--crop', 'centre'])[1].replace(str(bag), 'bags/bottle').replace(
         'one.json', 'bags/bottle.marks.json').replace('runs/squares', 'runs/bottle')
     assert f'\n{words}\n' in page, 'the page of the first hour has this command'
+    monkeypatch.setattr('tap_ros.apps.marking.MOST_LEVELS', 2)
+    many = Marking(store, [str(bag)], tmp_path / 'many.json')
+    for i in range(2):
+        many.mark(i, [2, 4, 6])
+    assert [shlex.split(line)[3] for line in many.commands([])] == ['label'], 'train would refuse'
     asked = parse(Options, label[4:])
     assert asked.recordings == (str(bag),) and asked.marks == 'my marks.json'
     assert asked.reading == replace(WholeReading(), rate=4, gap=2)

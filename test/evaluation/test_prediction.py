@@ -315,10 +315,32 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     assert sheet.shape == (20 + 3 * 130 - 2, panels * 130 - 2, 3)
 
 
+def test_weights_of_one_mark_are_scored_by_that_one(tmp_path):
+    bag, made, out = write_bag(tmp_path / 'bag', EPISODES), network(), tmp_path / 'out'
+    weights, marks = tmp_path / 'weights.safetensors', tmp_path / 'marks.json'
+
+    def scored(name, names):
+        write_marks(marks, store, [bag], {0: [(2, 2), (6, 6)], 2: [(3, 3), (7, 7)]}, names)
+        save_weights(weights, made, 'predictor', made.config, {'settings': {'mark_name': name}})
+        score(['--weights', str(weights), '--recordings', str(bag), '--all', '--marks',
+               str(marks), '--out', str(out)])
+        return json.loads((out / 'scores.json').read_text())['scores']['marks']['random'][0][0]
+
+    store = open_recordings([bag], progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        every = scored('', ('grasp', 'release'))
+        assert scored('release', ('grasp', 'release')) == pytest.approx(every / 2)
+        for names in ((), ('grasp', 'lift')):
+            with pytest.raises(ConfigError, match='^mark_name: release is none of the marks'):
+                scored('release', names)
+
+
 def test_another_predictor_is_scored_by_what_it_shows_and_its_maps(tmp_path, capsys):
     bag, out = write_bag(tmp_path / 'bag', EPISODES[:1]), tmp_path / 'out'
     score(['--weights', f'nearest_keyframe:{bag}', '--recordings', str(bag), '--all',
            '--goal-picture', 'last', '--out', str(out)])
+    assert 'all episodes, also those trained on' in capsys.readouterr().out
     scores = json.loads((out / 'scores.json').read_text())['scores']
     assert scores['prediction']['min_l1'] < 1e-6  # it has seen this episode
     assert scores['prediction']['bottleneck_median'] < scores['copy-goal']['bottleneck_median'] / 2

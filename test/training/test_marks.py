@@ -73,7 +73,8 @@ def test_marks_of_something_else_are_refused_with_the_file_and_the_reason(bag, s
             ({'episode': 24}, 'expected 0 to 23'), ({'stamps': [begin - 1]}, 'outside'),
             ({'stamps': [end + 1]}, 'outside'), ({'stamps': [begin]}, 'start or the goal'),
             ({'stamps': [begin + 1, begin + 0.5]}, 'in order'), ({'stamps': 3}, 'list of seconds'),
-            ({'stamps': [float('nan')]}, 'as seconds'), ('{', 'no file of marks')):
+            ({'stamps': [float('nan')]}, 'as seconds'), ('{', 'no file of marks'),
+            ({'episode': True}, 'no file of marks')):
         assert said in refusal(data), data
     entry = {'recording': str(bag), 'episode': 0, 'stamps': [begin + 0.5]}
     for names in ('grasp', ['grasp', 'grasp'], ['']):
@@ -141,6 +142,10 @@ def test_the_likeliest_frames_are_those_about_the_label(bag, store, marks, tmp_p
                          ({}, 'has 2, .* or choose one of grasp, release by --mark-name')):
         with pytest.raises(ConfigError, match=said):
             episode_preferences(store, replace(config, **values), everything)
+    with_one_less = {**read_marks(marks, store).episodes, 4: [(2, 2)]}
+    write_marks(marks, store, [bag], with_one_less, ('grasp', 'release'))
+    with pytest.raises(ConfigError, match='demonstration 4 has 1, not as many as the names grasp'):
+        episode_preferences(store, replace(config, mark_name='grasp'), everything)
     for values in ({'recursion': 2}, {'marks': '', 'selection': 'relative'}):
         with pytest.raises(ConfigError, match='^mark_name'):
             replace(config, mark_name='grasp', **values).check()

@@ -26,7 +26,7 @@ from tap_ros.weights import PREDICTORS
 
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
-STEP_BUDGET = 80  # of a goal: more than by itself, since somebody watches who can cancel
+STEP_BUDGET = 80  # of a goal in the simulator; for a real arm the planner's own limit holds
 END_S = 6.0  # that a cancel may take when the node ends
 LARGEST = 1e6  # of a pixel
 UNDER_WAY = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
@@ -129,9 +129,9 @@ class ExplorerCalls:
         return self._client.silence('visual_mpc_node') or self._stage or (
             "another client's goal" if not self._asked else '')
 
-    def forget_end(self) -> None:
-        """Forget how the last goal ended: there is another one."""
-        self.end: dict[str, Any] = {'end': '', 'reached': False, 'spent': False}
+    def forget_end(self, said: str = '', reached: bool = False, spent: bool = False) -> None:
+        """Forget how the last goal ended: there is another one, or it ended in another way."""
+        self.end: dict[str, Any] = {'end': said, 'reached': reached, 'spent': spent}
 
     def do(self, text: str | bytes) -> None:
         """
@@ -183,7 +183,7 @@ class ExplorerCalls:
                 said = f'{REFUSED[do]}: {plain(text)}'
                 self._display.events.add(said, problem=True)
                 if do == 'reach':
-                    self.end = {'end': said, 'reached': False, 'spent': False}
+                    self.forget_end(said)
                 if isinstance(error, TapError):
                     self._node.get_logger().info(f'{do}: {text}')
                 else:
@@ -256,8 +256,8 @@ class ExplorerCalls:
         if cancelled:
             raise CallError(f'{words}: cancelled before it began')
         goal = self._client.reach(
-            mode=mode, step_budget=STEP_BUDGET, on_feedback=self._on_feedback,
-            timeout_s=GOAL_TIMEOUT_S)
+            mode=mode, step_budget=STEP_BUDGET if self.offered('reset') else 0,
+            on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
         with self._lock:
             self._goal, cancelled = goal, self._cancelled
         if cancelled:  # meanwhile
@@ -267,7 +267,7 @@ class ExplorerCalls:
         end = 'cancelled' if result.end == 'cancelled' else plain(escaped(result.message, 1000))
         end = f'{words}: {end} ({result.steps} steps)'
         spent = result.end == 'succeeded' and not result.success
-        self.end = {'end': end, 'reached': result.success, 'spent': spent}
+        self.forget_end(end, result.success, spent)
         self._display.events.add(end)
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
