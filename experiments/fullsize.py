@@ -207,7 +207,7 @@ def table(found: dict[str, list[dict[str, float]]]) -> str:
 
 
 def truth_is_known(row: str) -> bool:
-    """Tell whether a row of the table has true pictures."""
+    """Return whether a row of the table has true pictures."""
     return row in ('push2', 'order2')
 
 

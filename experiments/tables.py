@@ -60,7 +60,7 @@ def number(row, unit=1.0, digits=0, after='%', sign=''):
 
 
 def reached(yes, *aim):
-    """Say whether an aim is reached."""
+    """Return whether an aim is reached."""
     return ': '.join(('reached' if yes else '**missed**', *aim))
 
 

@@ -210,7 +210,7 @@ def _check_settings(folder: Path, config: CollectConfig) -> None:
 
 
 def _is_whole(folder: Path, config: CollectConfig, shard: int) -> bool:
-    """Say whether a file is there with all its episodes; the last may have been of fewer."""
+    """Return whether a file is there with all its episodes; the last may have been of fewer."""
     path, episodes = _shard_path(folder, shard), _episodes(config, shard)
     marked = _bottlenecks(folder)
     if marked and marked.keys().isdisjoint(episodes):

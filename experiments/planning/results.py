@@ -93,7 +93,7 @@ def _row(task, name, metric, found, count, **more):
 
 
 def comparable(compares, settings, others):
-    """Say whether the settings of two results differ in nothing but what is compared."""
+    """Return whether the settings of two results differ in nothing but what is compared."""
     same = all(settings[key] == others[key] for key in SAME if key != compares)
     if compares not in ('direct, twice', 'search'):  # these are settings of the planner
         same &= settings['planner'] == others['planner']

@@ -88,7 +88,7 @@ def predicted_maps(pixels: np.ndarray, prediction: Prediction, b: int,
 
 
 def can_be_bottleneck(pixels: np.ndarray) -> bool:
-    """Say whether there are two objects or more, known and moved; pixels (2, K, 2)."""
+    """Return whether there are two objects or more, known and moved; pixels (2, K, 2)."""
     return bool(pixels.shape[1] >= 2 and np.isfinite(pixels).all() and (
         np.linalg.norm(pixels[1] - pixels[0], axis=-1).min() >= MIN_MOTION))
 

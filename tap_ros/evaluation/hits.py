@@ -11,7 +11,7 @@ from tap_ros.training.marks import chance
 
 
 def is_hit(marks: Sequence[Mark], frame: int, off: int = 0) -> bool:
-    """Say whether a frame is within one of the marks of its episode, or so many beside it."""
+    """Return whether a frame is within one of the marks of its episode, or so many beside it."""
     return any(first - off <= frame <= last + off for first, last in marks)
 
 

@@ -130,7 +130,7 @@ class Crop:
 
 
 def is_halved(side: int) -> bool:
-    """Say whether a side can be halved until 4 or 6 pixels are left, and has 16 at least."""
+    """Return whether a side can be halved until 4 or 6 pixels are left, and has 16 at least."""
     return side >= 16 and side // (side & -side) in (1, 3)
 
 
@@ -166,7 +166,7 @@ class TrainedCrop:
 
     def is_cut(self, size: Sequence[int]) -> bool:
         """
-        Say whether a picture that is cut already can be of a size, scaled or not.
+        Return whether a picture that is cut already can be of a size, scaled or not.
 
         :param size: its (height, width): not smaller than the network's, and of the shape of that,
             or of the camera's where all of the picture is squeezed into it.

@@ -290,7 +290,7 @@ class _Decoder:
 
     def _is_due(self, times: tuple[int, int], by_log: bool) -> bool:
         """
-        Tell whether a picture is taken, so that no more than the rate are.
+        Return whether a picture is taken, so that no more than the rate are.
 
         :param times: its stamp and log time, ns.
         :param by_log: its stamp tells nothing.

@@ -219,7 +219,7 @@ class Bag:
         return IMAGE.types if kind in IMAGE.types else (kind,)
 
     def _is_main_one(self, topic: str) -> bool:
-        """Tell whether its other topic, raw or compressed, has less than twice its pictures."""
+        """Return whether its other topic, raw or compressed, has less than twice its pictures."""
         raw = _plain(topic)
         other = raw if raw != topic else f'{topic}/compressed'
         return not (0 < 2 * self._counts.get(topic, 0) <= self._counts.get(other, 0)
@@ -266,11 +266,11 @@ class Bag:
         return why
 
     def _is_usable(self, topic: str) -> bool:
-        """Tell whether one of the first pictures of a topic can be used."""
+        """Return whether one of the first pictures of a topic can be used."""
         return isinstance(self._picture(topic), np.ndarray)
 
     def _is_coloured(self, topic: str) -> bool:
-        """Tell whether one of the first pictures of a topic has colours."""
+        """Return whether one of the first pictures of a topic has colours."""
         picture = self._picture(topic)
         return isinstance(picture, np.ndarray) and bool(np.ptp(picture, -1).any())
 

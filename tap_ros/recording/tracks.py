@@ -211,7 +211,7 @@ def _comparable(name: str, track: Track, frame: Track) -> tuple[Track, bool]:
 
 
 def _goes_back(frame: Track, mark: Track, gaps: np.ndarray) -> bool:
-    """Tell whether stamps go back, other than where an episode begins, or one was overtaken."""
+    """Return whether stamps go back, other than where an episode begins, or one was overtaken."""
     steps = np.diff(frame.stamp)
     places = np.flatnonzero(steps < 0) + 1
     period = float(np.median(steps)) if len(places) else 0
@@ -225,7 +225,7 @@ def _goes_back(frame: Track, mark: Track, gaps: np.ndarray) -> bool:
 
 
 def _was_set(frame: Track, mark: Track, gaps: np.ndarray) -> bool:
-    """Tell whether the camera's clock was set forward, or back in a pause, by its log times."""
+    """Return whether the camera's clock was set forward, or back in a pause, by its log times."""
     steps, offset = np.diff(frame.stamp), frame.stamp - frame.log
     moves = np.diff(offset)
     if not len(moves) or np.median(np.abs(moves)) > np.median(steps) / 4:  # as in a simulation
@@ -275,7 +275,7 @@ def _away(track: Track, frame: Track) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_apart(track: Track, frame: Track) -> bool:
-    """Tell whether stamps are of another clock than the camera's, for a while at least."""
+    """Return whether stamps are of another clock than the camera's, for a while at least."""
     apart, inside = _away(track, frame)
     if len(inside) <= PROOF or np.isin(track.stamp[inside], frame.stamp).mean() > 0.5:
         return False  # what repeats stamps of frames is of the camera's clock, however late

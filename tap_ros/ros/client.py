@@ -122,11 +122,11 @@ class Client:
     # Nodes
 
     def is_ready(self, name: str) -> bool:
-        """Tell whether a node ('predictor_node', ...) is ready, or one of SERVICES is offered."""
+        """Return whether a node ('predictor_node', ...) is ready, or one of SERVICES is offered."""
         return bool(self._service(READY.get(name, name)).service_is_ready())
 
     def silence(self, name: str) -> str:
-        """Say for how long a node such as 'predictor_node' is silent; '' while it is not."""
+        """Return for how long a node such as 'predictor_node' is silent; '' while it is not."""
         return self._liveness(name).silence
 
     def wait_until_ready(self, *names: str, timeout_s: float = 90.0) -> None:

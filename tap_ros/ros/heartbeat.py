@@ -50,7 +50,7 @@ class Heartbeat:
 
 class Presence:
     """
-    Tell whether all that were in the ROS graph once, such as the servers of a call, have left it.
+    Return whether all that were in the ROS graph once, such as the servers of a call, have left it.
 
     The middleware removes a process that has ended, been killed, or stood still for longer than
     the lease of its DDS participant: 3 s as nodes set it up (see run.configure_fast_dds). A new
@@ -100,7 +100,7 @@ class Liveness:
 
     @property
     def silence(self) -> str:
-        """Say for how long the node has been silent; '' where that is nothing unusual."""
+        """Return for how long the node has been silent; '' where that is nothing unusual."""
         quiet_s = 0.0 if self._beat_at is None else time.monotonic() - self._beat_at
         return f'{self.name} has been silent for {quiet_s:.1f} s' if quiet_s > QUIET_S else ''
 

@@ -132,7 +132,7 @@ def _located(before: Picture, after: Picture, plane: Plane, cut: Cut,
 
 
 def _kept(before: np.ndarray, after: np.ndarray, plane: Plane) -> bool:
-    """Tell whether two pieces are as far apart as before; without calibration as it seems."""
+    """Return whether two pieces are as far apart as before; without calibration as it seems."""
     first, second = float(np.linalg.norm(before)), float(np.linalg.norm(after))
     factor = 1.0 if plane.calibrated else SEEMS
     return first / factor - NEAR < second < first * factor + NEAR

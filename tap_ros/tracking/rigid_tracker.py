@@ -202,7 +202,7 @@ class RigidTracker:
         return covered > 0
 
     def _still(self, one: _Object, before: Picture, now: Picture) -> bool:
-        """Tell whether two pictures show the same of an object and of what is next to it."""
+        """Return whether two pictures show the same of an object and of what is next to it."""
         outline = self._outline(one)
         u, v = (outline.min(0).astype(int) - BESIDE).clip(0)
         right, low = (outline.max(0).astype(int) + BESIDE).clip(0)

@@ -46,7 +46,7 @@ class Cut:
         return float(np.linalg.norm(centre(self.mask) - at)) if self.mask.any() else np.inf
 
     def sure(self, at: np.ndarray) -> bool:
-        """Tell whether it is all of an object that was clicked at a pixel, and nothing else."""
+        """Return whether it is all of an object that was clicked at a pixel, and nothing else."""
         return self.whole and not self.touched and self.off(at) < OFF
 
 

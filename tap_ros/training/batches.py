@@ -144,7 +144,7 @@ def target_times(end: int, margin: int, forward: bool = False) -> tuple[int, int
 def uses_recorded_goal(episode: 'Episode', goal_picture: str,
                        rng: np.random.Generator | None = None) -> bool:
     """
-    Say whether an episode's goal picture is the goal's own rather than its last frame.
+    Return whether an episode's goal picture is the goal's own rather than its last frame.
 
     In the last frame the arm stands beside the object that was pushed last, in the goal's own
     picture it does not.

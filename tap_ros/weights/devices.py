@@ -40,7 +40,7 @@ def placed(module: Placed, device: torch.device | str) -> Placed:
 
 def has_bfloat16(device: torch.device | str) -> bool:
     """
-    Say whether a device has instructions for bfloat16; others emulate it many times slower.
+    Return whether a device has instructions for bfloat16; others emulate it many times slower.
 
     Of CPUs those with AVX512_BF16 have.
     """

@@ -124,12 +124,12 @@ def shown(scenes: Sequence[Scene]) -> dict[str, Scene]:
 
 
 def gains(scene: Scene) -> bool:
-    """Tell whether a scene succeeds via the subgoal alone."""
+    """Return whether a scene succeeds via the subgoal alone."""
     return scene.runs['subgoal'].reached and not scene.runs['direct'].reached
 
 
 def gains_clearly(scene: Scene) -> bool:
-    """Tell whether besides an object is far from its goal after the direct run."""
+    """Return whether besides an object is far from its goal after the direct run."""
     return gains(scene) and bool(scene.runs['direct'].distances[-1].max() > CLEARLY)
 
 

@@ -115,7 +115,7 @@ def listed(places: Mapping[str, Place], message: ObjectStates | None = None
 
 
 def silence(now: float, newest: tuple[Any, float] | None) -> str:
-    """Say since when a topic is silent, in steps that do not change with every look."""
+    """Return since when a topic is silent, in steps that do not change with every look."""
     if newest is None:
         return 'nothing has come yet'
     age = now - newest[1]
@@ -124,7 +124,7 @@ def silence(now: float, newest: tuple[Any, float] | None) -> str:
 
 @cache
 def grips(task: str) -> bool:
-    """Tell whether a task needs a gripper, which nothing plans; False for an unknown one."""
+    """Return whether a task needs a gripper, which nothing plans; False for an unknown one."""
     try:
         return bool(getattr(load_plugin('tap_ros.tasks', task), 'gripping', False))
     except TapError:

@@ -54,7 +54,7 @@ class GoalSource:
 
     def changed(self, since: float) -> bool:
         """
-        Tell whether the goal is another one now, received before `since`.
+        Return whether the goal is another one now, received before `since`.
 
         :param since: monotonic time at which the request was accepted.
         :raises PlanningError: if the other goal was received later.

@@ -142,7 +142,7 @@ class TrackerInputs:
         return View(picture, self._mask(goal, 'goal/robot_mask', picture))
 
     def lacks_joints(self, moment: Moment) -> bool:
-        """Tell whether the joints of a picture may still come."""
+        """Return whether the joints of a picture may still come."""
         return (self._gripper.received > -math.inf and self._hand(moment.stamp_ns) is None
                 and time.monotonic() - moment.received < self._params['patience'])
 

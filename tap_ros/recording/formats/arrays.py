@@ -195,7 +195,7 @@ def _row(array: Any, row: int, budget: Budget) -> Any:
 
 
 def _holds_numbers(array: Any) -> bool:
-    """Tell whether an array is of some numbers a row, in its own file."""
+    """Return whether an array is of some numbers a row, in its own file."""
     shape = tuple(array.shape or ())
     return (array.dtype.kind in 'iufb' and len(shape) in (1, 2) and 0 < len(array) <= MOST_FRAMES
             and 0 < math.prod(shape[1:]) <= MOST_SIGNALS and not array.is_virtual
@@ -205,7 +205,7 @@ def _holds_numbers(array: Any) -> bool:
 
 def _holds_pictures(array: Any, budget: Budget) -> bool:
     """
-    Tell whether an array is of pictures.
+    Return whether an array is of pictures.
 
     :raises RecordingError: for one whose values are not all in its own file.
     """

@@ -224,7 +224,7 @@ class DataSet:
         return rows
 
     def _is_deep(self, camera: str) -> bool:
-        """Tell whether the pictures of a feature have 16 bits a pixel, as of depth."""
+        """Return whether the pictures of a feature have 16 bits a pixel, as of depth."""
         if self.is_video(camera):
             return False
         with suppress(*DAMAGE):

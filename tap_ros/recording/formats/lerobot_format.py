@@ -63,7 +63,7 @@ def signal_names(features: Mapping[str, Any], chosen: Iterable[str]) -> dict[str
 
 
 def is_depth(feature: dict[str, Any]) -> bool:
-    """Tell whether a feature is of depth by its description."""
+    """Return whether a feature is of depth by its description."""
     about = feature.get('info') or {}
     return any(about.get(name) for name in ('video.is_depth_map', 'is_depth_map'))
 

@@ -169,7 +169,7 @@ def _signals(floats: dict[str, np.ndarray], length: int, rows: np.ndarray) -> di
 
 
 def _is_picture(data: bytes) -> bool:
-    """Tell whether bytes are a picture file, or the pixels of a square picture."""
+    """Return whether bytes are a picture file, or the pixels of a square picture."""
     side = math.isqrt(len(data) // 3)
     return data.startswith(FILES) or side >= 8 and side * side * 3 == len(data)
 
