@@ -122,7 +122,7 @@ class Client:
     # Nodes
 
     def is_ready(self, name: str) -> bool:
-        """Return whether a node ('predictor_node', ...) is ready, or one of SERVICES is offered."""
+        """Return whether a node ('predictor_node', ...) or one of SERVICES is ready."""
         return bool(self._service(READY.get(name, name)).service_is_ready())
 
     def silence(self, name: str) -> str:

@@ -50,7 +50,7 @@ class Heartbeat:
 
 class Presence:
     """
-    Return whether all that were in the ROS graph once, such as the servers of a call, have left it.
+    Whether all that were in the ROS graph once, such as the servers of a call, have left it.
 
     The middleware removes a process that has ended, been killed, or stood still for longer than
     the lease of its DDS participant: 3 s as nodes set it up (see run.configure_fast_dds). A new
