@@ -17,6 +17,7 @@ from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_uint8
 from tap_ros.images.robot_mask import fill_from_past
+from tap_ros.messages import topics
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.recording.cache import EpisodeStore
@@ -41,8 +42,13 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
     Train a forward model, or go on with a run that was interrupted, see run.Run.
 
     :return: path of the weights file.
+    :raises RecordingError: for recordings without commands; see also run.Run and model_config.
     """
     with Run(config, 'forward_model', HORIZON + 1, stop_at, progress) as run:
+        if not run.store.commands:
+            raise RecordingError(
+                'recordings: they hold no commands to the arm, which the forward model learns '
+                f'from; record {topics.TWIST.recorded}, too')
         network = LearnedForwardModel(model_config(config, run.store, run.training))
         if config.initial_weights and not run.checkpoint.exists():
             take_weights(network, config.initial_weights)

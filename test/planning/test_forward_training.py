@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 
+from made_bags import camera, mark, record
 from made_episodes import cover, write_bag
 import numpy as np
 import pytest
@@ -41,6 +42,15 @@ def test_windows_without_the_gripper_are_refused_by_the_number_of_their_episode(
     assert len(make_windows(store, Cuts([0, 1, 2], [2, 2, 4], 4), HOMOGRAPHY).images) == 3
     with pytest.raises(RecordingError, match='episode 2 lacks gripper positions'):
         make_windows(store, Cuts([0, 1, 2], [2, 2, 0], 4), HOMOGRAPHY)
+
+
+@pytest.mark.filterwarnings('ignore:recordings. only 0 episodes')
+def test_recordings_without_commands_are_refused(tmp_path):
+    bag = record(tmp_path / 'bag', [mark(1, 0), *map(camera, range(1, 13)), mark(13, 1)])
+    with pytest.raises(RecordingError, match='hold no commands to the arm'):
+        train(ForwardTrainingConfig(
+            recordings=(str(bag),), out=str(tmp_path / 'run'), steps=1, size=16, crop='centre',
+            test_fraction=0.0, threads=1), progress=False)
 
 
 def test_mirrored_windows_show_objects_where_the_mirrored_table_says():
