@@ -221,6 +221,7 @@ def test_a_scene_ends_the_same_on_a_busy_machine_and_after_a_node_has_ended(tmp_
         alone = command.run_scene([nodes], 'push2', SEED)
         with crowd(6):
             beside = command.run_scene([nodes], 'push2', SEED)
+        assert not isinstance(beside, Exception), beside
         nodes.processes._processes['sim_node'].kill()
         ended = command.run_scene([nodes], 'push2', SEED)
         after = command.run_scene([nodes], 'push2', SEED)
