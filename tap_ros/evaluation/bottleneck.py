@@ -67,23 +67,32 @@ def context_pixels(episode: Episode, goal_picture: str) -> np.ndarray:
     return np.stack([episode.object_pixels[0], goal]).astype(np.float32)
 
 
+def known_maps(pixels: np.ndarray, prediction: Prediction, bank: KeyframeBank | None,
+               alike: int = 0) -> torch.Tensor:
+    """
+    Return one-hot maps (1, C, K, H, W) of the objects in the pictures that are copied from.
+
+    :param pixels: float32 (2, K, 2), of context_pixels; a forward prediction uses the start only.
+    :param bank: that the third picture is from, of demonstration `alike`; None: there is none.
+    """
+    flow = prediction.flow
+    maps = one_hot_maps(
+        torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device), flow.shape[-2:])[None]
+    return maps if bank is None else bank.beside_maps(maps, pixels[:1], np.array([alike]))
+
+
 def predicted_maps(pixels: np.ndarray, prediction: Prediction, b: int,
                    bank: KeyframeBank | None = None, alike: int = 0) -> WarpedMaps:
     """
     Warp one-hot maps of the objects as a prediction warps its context pictures.
 
-    :param pixels: float32 (2, K, 2), of context_pixels; a forward prediction uses the start only.
+    :param pixels: float32 (2, K, 2), of context_pixels; bank, alike: as known_maps takes them.
     :param prediction: networks.Prediction of a batch.
     :param b: which one of the batch.
-    :param bank: that the third picture is from, of demonstration `alike`; None: there is none.
     :return: warp.WarpedMaps of (K, H, W) maps, each sums to 1, and (K,) masses.
     """
-    flow, masks = prediction.flow[b:b + 1], prediction.masks[b:b + 1]
-    maps = one_hot_maps(
-        torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device), flow.shape[-2:])[None]
-    if bank is not None:
-        maps = bank.beside_maps(maps, pixels[:1], np.array([alike]))
-    warped = warp_object_maps(maps, flow, masks)
+    warped = warp_object_maps(known_maps(pixels, prediction, bank, alike),
+                              prediction.flow[b:b + 1], prediction.masks[b:b + 1])
     return WarpedMaps(warped.maps[0], warped.mass[0])
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.evaluation.bottleneck import context_pixels
+from tap_ros.evaluation.bottleneck import context_pixels, known_maps
 from tap_ros.evaluation.prediction import all_targets, draw_latents
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
-from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
+from tap_ros.prediction.warp import expected_pixels, warp_object_maps
 import torch
 
 if TYPE_CHECKING:
@@ -71,14 +71,12 @@ def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: It
             spread = (prediction.image.std(0, correction=0) / 2).mean().item()
             pixels, placed = context_pixels(store[i], goal_picture), np.nan
             if prediction.new_pixels is None and pixels.size and np.isfinite(pixels).all():
-                flow, masks = prediction.flow, prediction.masks
-                maps = one_hot_maps(torch.from_numpy(pixels[:flow.shape[1]]).to(device),
-                                    flow.shape[-2:])[None]
-                if network.bank is not None:
-                    alike, _ = network.bank.find(batch.context.cpu().numpy())
-                    maps = network.bank.beside_maps(maps, pixels[:1], alike)
-                maps = maps.expand(count, -1, -1, -1, -1)
-                at = expected_pixels(warp_object_maps(maps, flow, masks).maps)  # samples, K, 2
+                bank, alike = network.bank, 0
+                if bank is not None:
+                    alike = int(bank.find(batch.context.cpu().numpy())[0][0])
+                maps = known_maps(pixels, prediction, bank, alike).expand(count, -1, -1, -1, -1)
+                at = expected_pixels(warp_object_maps(  # samples, K, 2
+                    maps, prediction.flow, prediction.masks).maps)
                 placed = ((at - at.mean(0)) ** 2).sum(-1).mean(0).sqrt().mean().item()
         errors = errors.amin(0, keepdim=True)  # the best sample for each target
         match = match_step(errors, batch.valid)

@@ -25,7 +25,7 @@ class ArmPlace:
     """
 
     def __init__(self, node: Node, params: Parameters, frames: FixedFrames | None = None) -> None:
-        self._node, self._params = node, params
+        self._node, self._declared = node, declared_mount(params)  # read-only parameters
         self._logged = ''  # what was wrong
         self._missing = [name for name in MOUNT if name not in params.given]
         self._typed = len(self._missing) < len(MOUNT)
@@ -40,7 +40,7 @@ class ArmPlace:
         :raises KinematicsError: where they contradict each other, or tf_static itself; where some
             parameters are missing; where the base is tilted, or in the middle of the table.
         """
-        typed, pose = declared_mount(self._params), self._frames.pose(self._frame, WORLD_FRAME)
+        typed, pose = self._declared, self._frames.pose(self._frame, WORLD_FRAME)
         if pose is None:
             if self._typed and self._missing:
                 raise KinematicsError(f'{", ".join(self._missing)}: not set, but other parameters '
@@ -89,7 +89,7 @@ class ArmPlace:
 
     def usual(self) -> Mount:
         """Return the Mount, that of the simulated table where nothing tells it; else as told."""
-        return self.told() or declared_mount(self._params)
+        return self.told() or self._declared
 
 
 def _same(one: Mount, other: Mount) -> bool:
