@@ -54,7 +54,7 @@ def warp(images: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
 @torch.inference_mode(False)
 def _pixels(H: int, W: int, dtype: torch.dtype,
             device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return (u, v) of each pixel, (2, H, W), and by what they are scaled for a grid, (2, 1, 1)."""
+    """Return (u, v) of each pixel, (2, H, W), and the scale of both for a grid, (2, 1, 1)."""
     v, u = (torch.arange(side, device=device, dtype=dtype) for side in (H, W))
     return (torch.stack([u.expand(H, W), v[:, None].expand(H, W)]),
             torch.tensor([2 / (W - 1), 2 / (H - 1)], device=device, dtype=dtype)[:, None, None])
