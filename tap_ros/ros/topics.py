@@ -102,18 +102,26 @@ def make_message(message_type: type[M], fields: Mapping[str, Any]) -> M:
 def _filled(message: M, fields: Mapping[str, Any]) -> M:
     """Set fields of a message; return it."""
     for name, value in fields.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, dict):  # quicker to tell than a Mapping
             _filled(getattr(message, name), value)
             continue
-        if isinstance(value, list) and value and isinstance(value[0], Mapping):
-            kind = message.get_fields_and_field_types()[name]  # type: ignore[attr-defined]
-            package, kind = kind.removeprefix('sequence<').removesuffix('>').split('/')
-            value = [make_message(message_class(f'{package}/msg/{kind}'), one) for one in value]
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            kind = _class_in_list(type(message), name)
+            value = [_filled(kind(), one) for one in value]
         elif isinstance(value, np.ndarray):
             # Any other type than array.array is checked byte by byte, which takes milliseconds.
-            value = array.array('B', value.tobytes())
+            data, value = value, array.array('B')
+            value.frombytes(data)
         setattr(message, name, value)
     return message
+
+
+@cache
+def _class_in_list(message_type: Any, name: str) -> type[Any]:
+    """Return the class of the messages in a list, the field of this name of a message."""
+    kind = message_type.get_fields_and_field_types()[name]
+    package, kind = kind.removeprefix('sequence<').removesuffix('>').split('/')
+    return message_class(f'{package}/msg/{kind}')
 
 
 def _encoder(message_type: type[M], fields: Callable[P, dict[str, Any]]) -> Callable[P, M]:
