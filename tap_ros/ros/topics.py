@@ -6,7 +6,7 @@ import array
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, cast, ParamSpec, TypeVar
 
 from builtin_interfaces.msg import Time
 import numpy as np
@@ -106,11 +106,11 @@ def _filled(message: M, fields: Mapping[str, Any]) -> M:
             _filled(getattr(message, name), value)
             continue
         if isinstance(value, list) and value and isinstance(value[0], dict):
-            kind = _class_in_list(type(message), name)
+            kind: Any = _class_in_list(cast(Any, type(message)), name)
             value = [_filled(kind(), one) for one in value]
         elif isinstance(value, np.ndarray):
             # Any other type than array.array is checked byte by byte, which takes milliseconds.
-            data, value = value, array.array('B')
+            data, value = value.data, array.array('B')
             value.frombytes(data)
         setattr(message, name, value)
     return message
