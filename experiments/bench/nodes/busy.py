@@ -92,16 +92,33 @@ def works(stack):
     mpc = VisualMPC.load(FORWARD_MODEL, with_preset('large'))
     yield Work('plan of `large`', CORES,
                lambda: np.median(planning.time_plans(mpc, seen, goal, 5)[0]) / 1000)
+    with predictor(folder):
+        with asking() as seconds:
+            yield Work('answer', 1, seconds)
+        yield Work('answer to one of 16 clients', CORES,
+                   lambda: 1 / service.measure_load(16, 3).per_second)
+    with contextlib.suppress(PermissionError), recording.scheduled(os.SCHED_RR, 1), \
+            predictor(folder), asking() as seconds:
+        yield Work('answer, node and client by `chrt --rr 1`,', 1, seconds)
+    yield Work('start of all nodes', CORES, lambda: start.time_start()[0])
+
+
+@contextlib.contextmanager
+def predictor(folder):
+    """Run a predictor node."""
     with NodeProcesses(folder) as nodes:
         nodes.start('predictor_node', weights=DEFAULT_PREDICTOR)
         nodes.wait_until_ready()
-        with Client() as client:
-            ask, request = service.make_client(client, SERVICE_QOS.depth), service.make_request()
-            yield Work('answer', 1, lambda: np.median(service.timed(
-                partial(call, ask, request, service.TIMEOUT), 100)))
-        yield Work('answer to one of 16 clients', CORES,
-                   lambda: 1 / service.measure_load(16, 3).per_second)
-    yield Work('start of all nodes', CORES, lambda: start.time_start()[0])
+        yield
+
+
+@contextlib.contextmanager
+def asking():
+    """Give a function that asks a predictor node a hundred times, and returns the s of a call."""
+    with Client() as client:
+        ask, request = service.make_client(client, SERVICE_QOS.depth), service.make_request()
+        yield lambda: np.median(service.timed(
+            partial(call, ask, request, service.TIMEOUT), 100))
 
 
 def open_files(paths):
