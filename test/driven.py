@@ -26,9 +26,9 @@ SEED = 1_000_003
 
 
 @cache
-def first_pictures():
+def first_pictures(image_size=64):
     """Return the first Observation of a scene and its goal, from the simulator itself."""
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', image_size)
     try:
         return simulator.reset(SEED), simulator.goal()
     finally:

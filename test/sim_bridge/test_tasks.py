@@ -22,7 +22,7 @@ gripping = pytest.mark.parametrize('simulator', NUM_FRAMES, indirect=True)
 
 @pytest.fixture(scope='module')
 def simulator(request):
-    simulator = Simulator(request.param)
+    simulator = Simulator(request.param, 64)
     yield simulator
     simulator.close()
 
