@@ -25,6 +25,10 @@ class CallError(TapError):
     """A service, action or topic did not answer in time, or refused."""
 
 
+class NotYet(CallError):
+    """A service refused what it may do later: ask again."""
+
+
 def log_error(node: Node, what: str, error: BaseException) -> None:
     """Log an error in one line; an unexpected one, that is no TapError, with its traceback."""
     lines = [escaped(error, 1000)] if isinstance(error, TapError) else [
