@@ -25,6 +25,10 @@ class CallError(TapError):
     """A service, action or topic did not answer in time, or refused."""
 
 
+class NotYet(CallError):
+    """A service refused what it may do later: ask again."""
+
+
 def countdown(what: str, seconds: float) -> Callable[[], float]:
     """Return a function that tells how many seconds are left; CallError once there are none."""
     deadline = time.monotonic() + seconds

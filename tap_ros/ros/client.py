@@ -27,7 +27,7 @@ from tap_msgs.srv import PredictSubgoal, ResetScene, SelectObjects, SetGoal, Ste
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.ros.calls import call, CallError, countdown, Spinner
+from tap_ros.ros.calls import call, CallError, countdown, NotYet, Spinner
 from tap_ros.ros.goal_senders import CLIENT
 from tap_ros.ros.heartbeat import Liveness
 from tap_ros.ros.observations import Observations
@@ -40,6 +40,7 @@ from tap_ros.ros.requests import (
     seconds_of,
     subgoals_of,
     text_of,
+    WAITING,
 )
 from tap_ros.ros.run import configure_fast_dds
 from tap_ros.ros.topics import SERVICE_QOS, to_stamp
@@ -153,7 +154,8 @@ class Client:
         :param service: one of SERVICES.
         :param fields: of its request.
         :return: its response.
-        :raises CallError: when it does not answer in time, leaves the ROS graph, or refuses.
+        :raises CallError: when it does not answer in time, leaves the ROS graph, or refuses;
+            calls.NotYet where it waits for a picture.
         :raises ConfigError: for values that a field cannot hold.
         """
         seconds, client = self._timeout(timeout_s), self._service(service)
@@ -162,7 +164,8 @@ class Client:
                         self._liveness(server))
         if not getattr(response, 'success', True):
             reason = getattr(response, 'message', 'the log of its node says why')
-            raise CallError(f'{client.service_name} refused: {escaped(reason, 1000)}')
+            error = NotYet if reason.startswith(WAITING) else CallError
+            raise error(f'{client.service_name} refused: {escaped(reason, 1000)}')
         return response
 
     # Subgoals and goals
