@@ -160,12 +160,12 @@ class Client:
         """
         seconds, client = self._timeout(timeout_s), self._service(service)
         kind, _, server = SERVICES[service]
-        response = call(client, make_request(kind.Request, fields), seconds, give_up,
-                        self._liveness(server))
+        response = call(
+            client, make_request(kind.Request, fields), seconds, give_up, self._liveness(server))
         if not getattr(response, 'success', True):
             reason = getattr(response, 'message', 'the log of its node says why')
-            error = NotYet if reason.startswith(WAITING) else CallError
-            raise error(f'{client.service_name} refused: {escaped(reason, 1000)}')
+            raise (NotYet if reason.startswith(WAITING) else CallError)(
+                f'{client.service_name} refused: {escaped(reason, 1000)}')
         return response
 
     # Subgoals and goals
@@ -255,7 +255,7 @@ class Client:
         """
         Start a scene in the simulator.
 
-        :param objects: wait for the objects, too; not where they are yet to be selected.
+        :param objects: wait for them, too; not where they are yet to be selected.
         :return: the first view of the camera, and the goal.
         :raises CallError: when the simulator refuses, or shows nothing.
         """
