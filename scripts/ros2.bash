@@ -9,6 +9,8 @@
 
 set -eo pipefail
 cd -P "$(dirname "${BASH_SOURCE[0]}")/.."
+. scripts/step.bash
+who=ros2
 log=$PWD/ros2/build.log
 repositories=(  # owner/name, tag, folders that are needed
   'ros2/ros2cli 0.32.2 ros2action ros2cli ros2component ros2doctor ros2interface ros2lifecycle
@@ -18,19 +20,6 @@ repositories=(  # owner/name, tag, folders that are needed
   'ros2/rosidl_runtime_py 0.13.1 .'
   'ros2/rcl_interfaces 2.0.2 composition_interfaces'
   'ros2/geometry2 0.36.4 tf2_msgs')
-
-# step 'what' command...: run quietly into the log, print one line with the time it took.
-step() {
-  local what=$1 begin=$SECONDS
-  shift
-  printf '[ros2] %s ... ' "$what"
-  if ! "$@" >>"$log" 2>&1 </dev/null; then
-    printf 'failed. The end of %s:\n\n' "$log"
-    tail -n 30 "$log"
-    exit 1
-  fi
-  printf '%d s\n' $((SECONDS - begin))
-}
 
 # Put the folders of one repository into ros2/src.
 get() {

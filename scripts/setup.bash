@@ -12,22 +12,11 @@
 set -eo pipefail
 unset PYTHONPATH  # of another ROS 2 that the shell has sourced
 cd -P "$(dirname "${BASH_SOURCE[0]}")/.."
+. scripts/step.bash
+who=set-up
 log=.venv/setup.log
 place=.venv/place  # two lines: the folder and the interpreter that .venv was made for
 torch_cpu_index=https://download.pytorch.org/whl/cpu
-
-# step 'what' command...: run quietly into the log, print one line with the time it took.
-step() {
-  local what=$1 begin=$SECONDS
-  shift
-  printf '[set-up] %s ... ' "$what"
-  if ! "$@" >>"$log" 2>&1 </dev/null; then
-    printf 'failed. The end of %s:\n\n' "$log"
-    tail -n 30 "$log"
-    exit 1
-  fi
-  printf '%d s\n' $((SECONDS - begin))
-}
 
 # Print the first interpreter that is Python 3.11 or 3.12, or nothing. Without PYTHON, one that
 # .venv was made with goes first.

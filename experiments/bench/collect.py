@@ -36,7 +36,7 @@ def run(args):
     with tempfile.TemporaryDirectory() as folder:
         config = CollectConfig(task=args.task, episodes=args.episodes, episodes_per_file=5)
         result = collect(Path(folder) / 'bench', config, Engine(workers=args.workers))
-    simulator = Simulator(args.task)
+    simulator = Simulator(args.task, 64)
     simulator.reset(0)
     begin = time.perf_counter()
     for _ in range(200):

@@ -45,7 +45,7 @@ class Options:
 
 def run(args):
     """Time plans of each preset, and say what the solvers find."""
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     seen = simulator.reset(FIRST_SCENE)
     goal = simulator.goal().object_pixels
     planners = {name: VisualMPC.load(args.weights, with_preset(name), args.device)
@@ -125,7 +125,7 @@ def compare_solvers(args):
     """Return rows: what other solvers and fewer samples find beside CEM, in first plans."""
     default = with_preset('default')
     num_samples, few = default.search.num_samples, default.search.num_samples // 3
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     scenes = [(seed, as_scene(simulator.reset(seed)), simulator.goal().object_pixels)
               for seed in range(FIRST_SCENE, FIRST_SCENE + args.scenes)]
     simulator.close()

@@ -13,9 +13,9 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
 from tap_ros.base.text import escaped
-from tap_ros.ros.calls import CallError
+from tap_ros.ros.calls import NotYet
 from tap_ros.ros.client import Client
-from tap_ros.ros.requests import NOTHING_CAME, request_fields, subgoals_of
+from tap_ros.ros.requests import request_fields, subgoals_of
 from tyro import conf
 
 ASK_AGAIN_S = 0.5
@@ -78,8 +78,8 @@ def run(args: Options) -> None:
                     'predict', max(1.0, deadline - time.monotonic()), **fields,
                     mode='' if args.mode == 'auto' else args.mode, num_samples=args.samples,
                     recursion_depth=args.recursion, seed=args.seed)
-            except CallError as error:  # the first picture may be yet to come
-                if NOTHING_CAME not in str(error) or time.monotonic() > deadline:
+            except NotYet:
+                if time.monotonic() > deadline:
                     raise
                 time.sleep(ASK_AGAIN_S)
     print(f'{escaped(response.message, 500)}; {response.model_time_ms:.0f} ms')

@@ -112,6 +112,9 @@ def run(args: Options) -> None:
             print(f'  {name} at {u:.1f},{v:.1f}{faint}')
     write_atomically(args.out, labelled(parts, places, subgoals))
     print(f'written: {escaped(args.out)}')
+    if not names:
+        print('note: whether all objects are in the prediction is checked with --objects only; '
+              'look at the picture')
 
 
 def read_inputs(files: Mapping[str, str], positions: Mapping[str, Sequence[str]],

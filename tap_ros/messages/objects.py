@@ -3,7 +3,6 @@
 """Messages of objects to names and pixels and back."""
 
 from collections.abc import Iterable, Sequence
-import math
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from tap_ros.messages.stamps import header_fields, Stamp
 
 MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is predicted
 MAX_NAME = 100  # characters
-FAR = 100.0  # m, on no table
 
 
 def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray | None,
@@ -98,27 +96,6 @@ def decode_objects(message: Any, name: str,
         if not right:
             _check_pixel(f'{name}: {escaped(object_name)}', pixels[index], size)
     return names, pixels.astype(np.float32)
-
-
-def distance_in_words(objects: Any, goals: Any, pixels: float, width: int) -> str:
-    """
-    Say for people how far objects are from their goals, on average.
-
-    In cm where both messages tell all positions, in one frame; (0, 0, 0) is what nobody has filled
-    in. Else, and from FAR on, in per cent of the picture.
-
-    :param objects: tap_msgs/ObjectStates; goals: of at least the same objects.
-    :param pixels: the same distance in a picture; width: of that picture, px.
-    """
-    here, there = ({one.name: [getattr(one.pose.position, axis) for axis in 'xyz']
-                    for one in message.objects} for message in (objects, goals))
-    gaps = [math.dist(place, there[name]) if any(place) and any(there.get(name, ()))
-            else math.nan for name, place in here.items()]
-    mean = sum(gaps) / max(len(gaps), 1)
-    same = objects.header.frame_id == goals.header.frame_id
-    told = (f'{100 * mean:.1f} cm' if same and 0 < mean < FAR else
-            f'{100 * pixels / width:.1f}% of the picture')
-    return f'objects on average {told} from their goals'
 
 
 def decode_cut_objects(message: Any, name: str, size: Sequence[int],

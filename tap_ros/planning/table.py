@@ -45,6 +45,10 @@ class Table:
         """Return the pixel (n, n, 2) of every cell, (u, v)."""
         return project(self.homography, self.points()).view(self.cells, self.cells, 2)
 
+    def places(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Return where on the table, in metres, pixels (..., N, 2) (u, v) are."""
+        return project(torch.linalg.inv(self.homography), pixels)
+
     def seed_maps(self, pixels: torch.Tensor) -> torch.Tensor:
         """
         Put a map for each object on the grid, bilinearly at its pixel, then blur it by one cell.
@@ -53,7 +57,7 @@ class Table:
         :return: (K, n, n), each summing to 1.
         """
         n = self.cells
-        points = project(torch.linalg.inv(self.homography), pixels[:, None])
+        points = self.places(pixels[:, None])
         at = ((points / self.half + 1) * (n - 1) / 2).clamp(0, n - 1.001)  # (K, 1, 2) x, y
         low = at.long()
         shares = torch.stack([1 - (at - low), at - low])

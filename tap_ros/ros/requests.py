@@ -17,7 +17,7 @@ from tap_ros.messages.subgoals import decode_subgoals, Subgoal
 from tap_ros.ros.topics import encode_image, encode_objects, to_stamp
 
 FOREVER_S = 1e9  # longer than threads can wait
-NOTHING_CAME = 'the request has none and nothing has come on'  # in a refusal of predictor_node
+WAITING = 'waiting'  # a refusal of predict_subgoal begins so while a picture has yet to come
 
 
 def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any]:

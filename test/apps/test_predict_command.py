@@ -42,9 +42,14 @@ def test_it_predicts_what_the_predictor_does_in_the_pixels_of_the_start_picture(
     told = capsys.readouterr().out
     found = np.array(re.findall(r'object_\d at ([\d.]+),([\d.]+)', told), float)
     assert found == pytest.approx((subgoal.expected_pixels + 0.5) * 3 - 0.5, abs=0.2)
-    assert str(out) in told
+    assert str(out) in told and 'note' not in told
     picture = cv2.imread(str(out))
     assert picture.shape[1] > 3 * picture.shape[0] and picture.std() > 20
+
+
+def test_without_objects_it_says_that_one_may_be_missing(files, tmp_path, capsys):
+    assert main(['predict', *files, '--out', str(tmp_path / 'subgoal.png')]) == 0
+    assert '--objects' in capsys.readouterr().out
 
 
 def refusal(capsys, *arguments):

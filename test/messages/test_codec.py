@@ -106,24 +106,6 @@ def test_objects_survive_the_round_trip_and_are_matched_by_name():
     assert objects.decode_objects(ObjectStates(), 'objects')[1].shape == (0, 2)
 
 
-@pytest.mark.parametrize(('here', 'there', 'words'), [
-    ([(0.1, 0, 0.03), (0, 0, 0.03)], [(0.1, 0.04, 0.03), (0.01, 0, 0.03)], '2.5 cm from'),
-    ([(0.1, 0, 0.03)], [(np.nan, 0, 0.03)], '3.1% of the picture from'),
-    ([(0.1, 0, 0.03)], [(0, 0, 0)], '3.1% of the picture from'),  # nobody has filled it in
-    ([(0.1, 0, 0.03)], [(1e300, 0, 0.03)], '3.1% of the picture from'),
-    ([(0.1, 0, 0.03)], [], '3.1% of the picture from'), ([], [], '3.1% of the picture from')])
-def test_distances_are_told_in_cm_or_where_positions_are_unknown_in_per_cent(here, there, words):
-    def message(places):
-        poses = np.pad(np.reshape(places, (-1, 3)), ((0, 0), (0, 4)))
-        return ros_topics.encode_objects(
-            [f'object_{k}' for k in range(len(places))], np.zeros((len(places), 2)), poses,
-            to_stamp(0), 'world', ObjectStates.SOURCE_TRACKED)
-    assert words in objects.distance_in_words(message(here), message(there), 2.0, 64)
-    elsewhere = message(there)
-    elsewhere.header.frame_id = 'camera'
-    assert '3.1% of' in objects.distance_in_words(message(here), elsewhere, 2.0, 64)
-
-
 @pytest.mark.parametrize('pixels, names, words', [
     ([[1, 2], [np.nan, 3]], ('red', 'blue'), ['blue', 'nan']),
     ([[np.inf, 2], [1, 3]], ('red', 'blue'), ['red', 'inf']),

@@ -9,6 +9,7 @@ from pathlib import Path
 import re
 import threading
 
+from browsing import chromium, hidden_or_over, needs_browser, opened
 from builtin_interfaces.msg import Time
 from mcap.reader import make_reader
 import numpy as np
@@ -136,6 +137,20 @@ def test_the_page_is_one_file_with_everything_inside(tmp_path):
     assert re.findall('<h2>(.*)</h2>', page) == ['order2 7', '&lt;order3&gt; 7']
     assert page.count('src="data:image/') == page.count('<img ') == 2 + 2 * 4
     assert 'http' not in page and page.count('predicted: 1 first') == 2 * 2
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_page_fits_a_desk_and_a_phone(tmp_path):
+    path = tmp_path / 'report.html'
+    write_report(path, [scene(), scene(7, 0.03, 'order3')], {'one': film(scene())}, 'by a test',
+                 {'command': 'python -m tap_ros demo --out ' + 20 * 'a_long_name_'})
+    with chromium() as browser:
+        for size in ((1280, 800), (375, 812)):
+            with opened(browser, path.as_uri(), size) as page:
+                assert not hidden_or_over(page, 'h1'), size
+                told = page.inner_text('tbody tr')
+                assert 'order2' in told and '+8.0' in told
 
 
 def test_the_film_shows_each_run_to_its_end_and_what_it_heads_for():

@@ -50,6 +50,16 @@ def served(loop, steps=1):
     assert result.end == 'succeeded' and result.steps == steps, result.message
 
 
+def test_how_far_objects_are_is_told_in_cm_whatever_the_goal_was_made_of(loop):
+    loop.reset()
+    goal = loop.client.goal()
+    for pixels in (None, dict(zip(goal.names, goal.pixels))):  # sent along: without positions
+        result = loop.client.reach(goal_pixels=pixels, mode='direct', step_budget=1).result()
+        told, = re.findall(r'average ([\d.]+) cm from their goals', result.message)
+        gaps = np.linalg.norm(loop.client.camera().positions - goal.positions, axis=1)
+        assert float(told) == pytest.approx(100 * gaps.mean(), abs=0.5)
+
+
 def aborted(loop, *words, **fields):
     """Check that a goal is aborted for this reason before a command."""
     count = len(loop.moves())

@@ -42,3 +42,5 @@ def test_maps_sum_to_one_and_have_their_mean_at_the_pixel():
     torch.testing.assert_close(maps.sum((1, 2)), torch.ones(2))
     mean = maps.flatten(1) @ table.pixels().flatten(0, 1)
     torch.testing.assert_close(mean, pixels, atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        project(table.homography, table.places(pixels)), pixels, atol=1e-3, rtol=0)

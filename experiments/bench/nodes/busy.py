@@ -86,7 +86,7 @@ def works(stack):
     paths, _ = recording.write_files(folder, 'none', 100, 1)
     yield Work('open 100 episodes', 1, partial(open_files, paths))
     yield Work('training step', 1, train_steps)
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     seen, goal = simulator.reset(FIRST_SCENE), simulator.goal().object_pixels
     simulator.close()
     mpc = VisualMPC.load(FORWARD_MODEL, with_preset('large'))

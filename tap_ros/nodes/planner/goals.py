@@ -33,7 +33,6 @@ class GoalSource:
     :param params: Parameters of the node.
     :param inputs: PlannerInputs, which knows how the planner sees pictures.
     :param client: Client that asks for subgoals.
-    :ivar objects: of the goal, as they came.
     """
 
     def __init__(self, node: Node, params: Parameters, inputs: PlannerInputs, client: Client,
@@ -46,7 +45,7 @@ class GoalSource:
 
     def begin(self, request: ReachGoal.Goal, mode: str) -> None:
         """Begin a request; the fields that it leaves empty come from their topics."""
-        self._request, self._mode, self.objects = request, mode, request.goal_objects
+        self._request, self._mode = request, mode
         self._needed = tuple(topic for topic, empty in (
             ('image', mode == 'subgoal' and is_empty(request.goal_image)),
             ('objects', not request.goal_objects.objects)) if empty)
@@ -79,7 +78,6 @@ class GoalSource:
             raise PlanningError('objects: none are seen, so there is nothing to push; publish '
                                 'their pixels')
         picture, objects = self._take(go_on)
-        self.objects = objects
         check_found(objects, 'goal_objects')
         names, pixels = self._inputs.decode_positions(
             objects, 'goal_objects', None if picture is None else picture.shape[:2])

@@ -21,7 +21,6 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused
 from tap_ros.base.errors import ConfigError, PlanningError, TapError
 from tap_ros.base.text import escaped, listing
-from tap_ros.messages.objects import distance_in_words
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES, TWIST
 from tap_ros.nodes.planner import settings
@@ -42,6 +41,7 @@ from tap_ros.ros.robot_view import warn_if_unlike
 from tap_ros.ros.subscriptions import publishers_of, steady_timer
 from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, STREAM, to_stamp
 from tap_ros.weights import find_forward_model
+import torch
 
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'
@@ -284,10 +284,8 @@ class VisualMpcNode(LifecycleBase):
                 if answer.outcome == 'aborted':
                     raise PlanningError(answer.message)
                 self._distance.publish(Float64(data=reach.distance))
-                far = distance_in_words(self._inputs.objects, self._goal.objects, reach.distance,
-                                        self._mpc.image_size[1])
                 result.success = answer.outcome == 'reached'
-                result.message = f'{answer.message}: {far}'
+                result.message = f'{answer.message}: {self._how_far(reach)}'
                 return
             if isinstance(answer, SelectTargets):
                 targets = self._goal.targets(
@@ -303,6 +301,14 @@ class VisualMpcNode(LifecycleBase):
                 self._publish_progress(handle, reach, answer)
             else:
                 self._sensors.wait_for_change(0.1, count)
+
+    def _how_far(self, reach: Reach) -> str:
+        """Say how far objects are from their goals, on the table as the model sees it."""
+        table = self._mpc.model.table
+        here, there = (table.places(torch.as_tensor(pixels, device=table.device)) for pixels in (
+            reach.pixels, reach.targets[-1].pixels))
+        far = float((here - there).norm(dim=-1).mean())
+        return f'objects on average {100 * far:.1f} cm from their goals'
 
     def _send(self, handle: ServerGoalHandle, accepted: float, reach: Reach,
               command: Command) -> bool:

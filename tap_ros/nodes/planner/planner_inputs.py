@@ -48,7 +48,7 @@ class PlannerInputs:
     :ivar topics: short names of what is looked at, the joints last.
     :ivar sensors: Observations.
     :ivar robot: RobotView.
-    :ivar frame_id: of the picture that was seen last; objects: in it, as they came.
+    :ivar frame_id: of the picture that was seen last.
     """
 
     def __init__(self, node: Node, params: Parameters, crop: Callable[[], TrainedCrop],
@@ -78,7 +78,6 @@ class PlannerInputs:
         self._since, self.frame_id = since, ''
         self._seen: Observation | None = None
         self._shown: np.ndarray | None = None  # its picture, of the camera's size
-        self.objects = ObjectStates()
         self._publishers = publishers_of(self._node, *self._names.values())
 
     def look(self) -> tuple[Observation | None, str]:
@@ -204,7 +203,7 @@ class PlannerInputs:
             order = [names.index(name) for name in self._seen.names]
             names, pixels = self._seen.names, pixels[order]
             states = tuple(states[k] for k in order) if states else ()
-        self._shown, self.objects = picture, messages['objects']
+        self._shown = picture
         return Observation(self.cut(picture, name), gripper, names, pixels, moment.stamp_ns,
                            states=states)
 

@@ -34,7 +34,7 @@ from tap_ros.prediction.protocol import Predictor, Request
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.parameters import Parameters
 from tap_ros.ros.polling import PollOnlyGroup
-from tap_ros.ros.requests import NOTHING_CAME
+from tap_ros.ros.requests import WAITING
 from tap_ros.ros.robot_view import RobotView
 from tap_ros.ros.subscriptions import publishers_of, rivals
 from tap_ros.ros.topics import camera_topics, encode_subgoal, goal_topics, LATCHED, STREAM
@@ -182,7 +182,7 @@ class RequestReader:
         found = newest.wait(['image'], self._discovered - time.monotonic())
         if found is None:
             raise ImageError(
-                f'{name}: {NOTHING_CAME} '
+                f'{WAITING}: {name}: the request has none and nothing has come on '
                 f'{newest.names(["image"], explained=True)}; publish one there '
                 '(the simulator does at sim/reset), or send it along')
         needed = ['image']
