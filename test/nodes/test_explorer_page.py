@@ -171,7 +171,7 @@ def test_outlines_turn_with_objects_and_a_goal_that_is_moved_is_not_gone_on_to(e
             page.mouse.up()
             page.wait_for_function(
                 f'state.goal.objects.some(({{u}}) => Math.abs(u - {place[0]}) < 2)')
-        page.wait_for_function("/^go straight/.test($('direct').textContent)")
+        page.wait_for_function("/^go directly/.test($('direct').textContent)")
         assert says(page, 'go') == 'needs the planner, which does not run'
 
 

@@ -128,7 +128,7 @@ function showState() {
   allow('direct', busy || done.go[2], 'to the goal at once');
   allow('subgoal-run', busy || done.go[2] || done.predict[2], 'first to a predicted subgoal');
   $('subgoal-run').textContent = `go ${run.spent ? 'on ' : ''}via the subgoal`;
-  $('direct').textContent = `go ${run.spent ? 'on ' : ''}straight to the goal`;
+  $('direct').textContent = `go ${run.spent ? 'on ' : ''}directly`;
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
   $('propose').hidden = $('follow').hidden = !selecting();
