@@ -106,7 +106,8 @@ def reset(page, task='push2', last='scene'):
     before = state(page)['events']
     page.click('#start')
     page.wait_for_function(f'state.events > {before} && events.at(-1).text.startsWith("{last}")')
-    page.wait_for_function('state.movable')
+    page.wait_for_function(
+        'state.movable && state.camera.objects.length && !missingGoals().length')
 
 
 def newest(page):
