@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run `python -m experiments ...`: what makes results, benchmarks and shipped weights again."""
 
+from functools import partial
 import sys
 
 from tap_ros.apps.cli import Command, CommandLine, EXTRAS, main
@@ -57,44 +58,11 @@ def _weights():
     return Command(Options, run)
 
 
-def _bench_collect():
-    from experiments.bench.collect import Options, run
-    return Command(Options, run)
-
-
-def _bench_recording():
-    from experiments.bench.recording import Options, run
-    return Command(Options, run)
-
-
-def _bench_growth():
-    from experiments.bench.growth import Options, run
-    return Command(Options, run)
-
-
-def _bench_training():
-    from experiments.bench.training import Options, run
-    return Command(Options, run)
-
-
-def _bench_planning():
-    from experiments.bench.planning import Options, run
-    return Command(Options, run)
-
-
-def _bench_service():
-    from experiments.bench.nodes.service import Options, run
-    return Command(Options, run)
-
-
-def _bench_start():
-    from experiments.bench.nodes.start import Options, run
-    return Command(Options, run)
-
-
-def _bench_busy():
-    from experiments.bench.nodes.busy import Options, run
-    return Command(Options, run)
+def _bench(name):
+    def load():
+        from experiments.bench import everything
+        return Command(everything.module(name).Options, partial(everything.measure, name))
+    return load
 
 
 def _bench_all():
@@ -115,15 +83,15 @@ LINE = CommandLine('python -m experiments', 'Make results, benchmarks and weight
     'tracking': ('score the tracker on simulated scenes and real films', _tracking),
     'weights': ('make the shipped predictors again', _weights),
     'bench': ('measure speed', {
-        'collect': ('speed of collecting', _bench_collect),
-        'recording': ('speed of reading recordings', _bench_recording),
-        'growth': ('memory and time of large recordings', _bench_growth),
-        'training': ('speed of training the predictor', _bench_training),
-        'planning': ('time of a plan', _bench_planning),
-        'service': ('time of an answer of the predictor node', _bench_service),
-        'start': ('time until all nodes are ready', _bench_start),
-        'busy': ('the same beside busy processes', _bench_busy),
-        'all': ('one after the other, into a file', _bench_all)})})
+        'collect': ('speed of collecting', _bench('collect')),
+        'recording': ('speed of reading recordings', _bench('recording')),
+        'growth': ('memory and time of large recordings', _bench('growth')),
+        'training': ('speed of training the predictor', _bench('training')),
+        'planning': ('time of a plan', _bench('planning')),
+        'service': ('time of an answer of the predictor node', _bench('service')),
+        'start': ('time until all nodes are ready', _bench('start')),
+        'busy': ('the same beside busy processes', _bench('busy')),
+        'all': ('one after the other, what is not measured yet', _bench_all)})})
 
 if __name__ == '__main__':
     EXTRAS['pandas'] = 'pandas'

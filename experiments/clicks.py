@@ -4,12 +4,12 @@
 
 from dataclasses import replace
 
-from experiments.planning.following import CAMERA_SIZE, SLIP, slip
+from experiments.planning.following import SLIP, slip
 from experiments.tracks import fit_camera, RIGHT, SIDE, WRONG
 import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.table import lifted
-from tap_ros.base.contract import SEEN
+from tap_ros.base.contract import CAMERA_SIZE, SEEN
 from tap_ros.base.errors import TrackingError
 from tap_ros.evaluation.intervals import bootstrap, share_interval
 from tap_ros.images.robot_mask import nearest_free

@@ -89,7 +89,7 @@ def run(args: Options) -> None:
         task, _, demonstrated = row.partition(' ')
         network, training = load_network(weights)
         predictor = SubgoalPredictor(network, training)
-        camera = Simulator(task, image_size=CAMERA_SIZE)
+        camera = Simulator(task)
         scores = found[row] = []
         try:
             seeds = range(args.first_scene, args.first_scene + args.scenes)

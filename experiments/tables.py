@@ -10,6 +10,7 @@ their 95% intervals in brackets. A row is reached if its number is at least the 
 aim is `over` something, if the interval is.
 """
 
+from dataclasses import fields
 from functools import cache
 import json
 from pathlib import Path
@@ -24,6 +25,7 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 
 RESULTS = Path(__file__).parents[1] / 'docs' / 'results'
+SPEED = RESULTS / 'speed.json'
 PREDICTION, PLANNING, STACKING = 'prediction.csv', 'planning.json', 'stacking.json'
 LATE = 'late/planning.json'  # three objects in order, trained on late bottlenecks
 MARKS = re.compile(r'(<!-- table -->\n).*?(<!-- end -->)', re.DOTALL)
@@ -216,15 +218,23 @@ class Tables:
 
     def speed(self):
         """List what `make bench` measured and has an aim; what limits it where that is missed."""
-        for row in measured_speed()['rows']:
+        rows, differ = measured_speed()['rows'], origins()
+        for row in rows:
             if row['aim']:
-                *cells, limit = Row(**row).cells
-                yield *cells, '' if row['reached'] else limit
+                *cells, limit = Row(**{one.name: row[one.name] for one in fields(Row)}).cells
+                yield (*cells, '' if row['reached'] else limit,
+                       ', '.join(row[key] for key, values in differ.items() if len(values) > 1))
 
 
 def measured_speed():
-    """Return what `make bench` wrote: rows, and the machine they are of."""
-    return json.loads((RESULTS / 'speed.json').read_text())
+    """Return what `make bench` wrote: rows, each with where, when and of which code it is."""
+    return json.loads(SPEED.read_text())
+
+
+def origins():
+    """Return on which machines rows of speed with an aim were measured, of which commits, when."""
+    rows = [row for row in measured_speed()['rows'] if row['aim']]
+    return {key: {row[key] for row in rows} for key in ('machine', 'date', 'commit')}
 
 
 def markdown(lines, head=('claim', 'paper', 'here', 'aim')):
@@ -241,8 +251,11 @@ def page_path(name):
 def filled(name):
     """Return a page, 'prediction', 'planning', 'stacking' or 'speed', with its table anew."""
     text = page_path(name).read_text()
-    head = {'head': ('what', measured_speed()['machine'], 'ratio', 'aim', 'what limits it')
-            } if name == 'speed' else {}
+    head = {}
+    if name == 'speed':
+        machines = origins()['machine']
+        head = {'head': ('what', machines.pop() if len(machines) == 1 else 'here', 'ratio', 'aim',
+                         'what limits it', 'measured')}
     table = markdown(getattr(Tables(), name)(), **head)
     if not MARKS.search(text):
         raise ConfigError(f'{name}.md: expected <!-- table --> and <!-- end -->')

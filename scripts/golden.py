@@ -124,7 +124,7 @@ def plans():
 def loops():
     """Push twelve steps in the simulator, directly and via a predicted subgoal."""
     mpc, predictor = VisualMPC.load(FORWARD_MODEL), SubgoalPredictor.load('push2')
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     try:
         for text in ('direct', 'shipped'):
             run = run_episode(simulator, mpc, parse_method(text), 12, 1_000_003, predictor)

@@ -50,7 +50,7 @@ class CollectConfig:
     :param task: one that the world has, such as push2; of metaworld door-open-v3.
     :param episodes: how many in all; a larger number later adds to the same folder.
     :param seed: of the first episode; the others count on from it.
-    :param image_size: width and height in pixels.
+    :param image_size: width and height in pixels, by default what the shipped weights see.
     :param episodes_per_file: the bag is split into files of so many.
     :param frames: of the longest episode; 0: as is usual for the task.
     :param timing: when in an episode of several pushed objects the first one is home and the

@@ -18,6 +18,7 @@ from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera, Renderer
 from sim_bridge.world.gap import Gap
 from tap_ros.base.contract import (
+    CAMERA_SIZE,
     CONTROL_PERIOD,
     ROBOT_MASK_ARM,
     ROBOT_MASK_FREE,
@@ -54,7 +55,7 @@ class MetaWorld(GymWorld):
     object_names: tuple[str, ...] = ('object_0',)
     steps, reach = 4, REACH  # of demonstrations
 
-    def __init__(self, task: str = 'push-v3', image_size: int = 64) -> None:
+    def __init__(self, task: str = 'push-v3', image_size: int = CAMERA_SIZE) -> None:
         self.task_name, self.ways = task, WAYS.get(task, ())
         self.env, self.policy = make_env(task)
         self.camera = replace(CAMERA, width=image_size, height=image_size)

@@ -21,6 +21,7 @@ from sim_bridge.pushes import Route
 from sim_bridge.tasks.motions import direction
 from sim_bridge.world.camera import Camera, Renderer
 from tap_ros.base.contract import (
+    CAMERA_SIZE,
     CONTROL_PERIOD,
     LIFTED,
     ROBOT_MASK_ARM,
@@ -59,7 +60,7 @@ class CubeDouble(GymWorld):
 
     object_names = ('object_0', 'object_1')
 
-    def __init__(self, task: str = TASK, image_size: int = 64) -> None:
+    def __init__(self, task: str = TASK, image_size: int = CAMERA_SIZE) -> None:
         if task != TASK:
             raise SceneError(f'task {task!r} is unknown; valid: {TASK}')
         self.task_name, self.env = task, _make_env()

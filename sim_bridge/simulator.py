@@ -11,6 +11,7 @@ from sim_bridge.tasks.tasks import get_task, run_episode, sample_scene, task_nam
 from sim_bridge.world.looks import DEFAULT_LOOK, GRIP_SPREAD
 from sim_bridge.world.protocol import Observation
 from sim_bridge.world.table import lifted, Table
+from tap_ros.base.contract import CAMERA_SIZE
 from tap_ros.base.errors import SceneError
 from tap_ros.base.text import listing
 from tap_ros.robots.arm import DEFAULT_ARM
@@ -35,8 +36,9 @@ class Simulator(Table):
         nothing can be rendered.
     """
 
-    def __init__(self, task: str = 'push2', image_size: int = 64, look: str = DEFAULT_LOOK,
-                 appearance: str = 'usual', arm: str = DEFAULT_ARM) -> None:
+    def __init__(self, task: str = 'push2', image_size: int = CAMERA_SIZE,
+                 look: str = DEFAULT_LOOK, appearance: str = 'usual',
+                 arm: str = DEFAULT_ARM) -> None:
         self.task = get_task(task)
         self.task_name = self.task.name
         super().__init__(image_size, self.task.gripping, look, appearance, arm)

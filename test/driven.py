@@ -26,9 +26,9 @@ SEED = 1_000_003
 
 
 @cache
-def first_pictures():
+def first_pictures(image_size=64):
     """Return the first Observation of a scene and its goal, from the simulator itself."""
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', image_size)
     try:
         return simulator.reset(SEED), simulator.goal()
     finally:
@@ -82,7 +82,7 @@ class World:
     :ivar silent: names of what is not published, of TOPICS.
     :ivar objects: (K, 2) pixels and K names published, each None for the true ones.
     :ivar states: of the objects, published with them; [] for none.
-    :ivar gripper: (4,) published, None for the true one.
+    :ivar gripper: (4,) published, None for the true one; joints: {name: rad} of an arm instead.
     :ivar shift_s: added to all stamps; late_s: by which the joints are older than the rest.
     :ivar frozen: {topic: stamp in ns that it repeats}.
     :ivar clock_ns: that a clock repeats; None: there is none.
@@ -129,7 +129,7 @@ class World:
     def _reset(self):
         self.silent, self.frozen, self.clock_ns = set(), {}, None
         self.shift_s = self.late_s = 0.0
-        self.objects, self.states, self.gripper = (None, None), [], None
+        self.objects, self.states, self.gripper, self.joints = (None, None), [], None, {}
 
     def silence(self, *topics):
         """Publish these no longer; return when the last of them was sent."""
@@ -144,7 +144,10 @@ class World:
             TOPICS, (now_ns, now_ns, now_ns - int(1e9 * self.late_s))))
         seen = objects_message(self._seen, objects, *self.objects)
         seen.states = self.states
-        return {'joints': encode_joints(gripper, joints, WORLD_FRAME), 'objects': seen,
+        told = encode_joints(gripper, joints, WORLD_FRAME)
+        if self.joints:
+            told.name, told.position = list(self.joints), list(self.joints.values())
+        return {'joints': told, 'objects': seen,
                 'image': encode_image(self._seen.image, image, CAMERA_FRAME)}
 
     def publish(self, messages):

@@ -10,7 +10,7 @@ class Dot(GymWorld):
 
     task_name, object_names = 'dot', ('dot',)
 
-    def __init__(self, task='dot', image_size=64):
+    def __init__(self, task='dot', image_size=256):
         self.camera = Camera(image_size, image_size)
 
     def begin(self, seed):

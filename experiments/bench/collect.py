@@ -8,7 +8,7 @@ import tempfile
 import time
 from typing import Annotated
 
-from experiments.bench.rows import Row, show
+from experiments.bench.rows import Row
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import task_names
@@ -32,11 +32,11 @@ class Options:
 
 
 def run(args):
-    """Collect into a temporary folder and print where the time went; return rows."""
+    """Collect into a temporary folder and say where the time went."""
     with tempfile.TemporaryDirectory() as folder:
         config = CollectConfig(task=args.task, episodes=args.episodes, episodes_per_file=5)
         result = collect(Path(folder) / 'bench', config, Engine(workers=args.workers))
-    simulator = Simulator(args.task)
+    simulator = Simulator(args.task, 64)
     simulator.reset(0)
     begin = time.perf_counter()
     for _ in range(200):
@@ -44,7 +44,7 @@ def run(args):
     render = (time.perf_counter() - begin) / 200 * result['frames']
     seconds = result['seconds']
     busy = seconds['act'] + seconds['write']
-    return show([Row(
+    yield Row(
         f'collect an episode of `{args.task}`', f'{seconds["wall"] / result["episodes"]:.2f} s',
         busy / (seconds['act'] - render), 'its physics, in CPU time',
-        limit=f'rendering {render / busy:.0%}, writing {seconds["write"] / busy:.0%}')])
+        limit=f'rendering {render / busy:.0%}, writing {seconds["write"] / busy:.0%}')

@@ -22,10 +22,12 @@ import tempfile
 import time
 
 from experiments.bench.recording import make_episode
-from experiments.bench.rows import Row, show
+from experiments.bench.rows import Row
+from tap_ros.base.engines import run_tasks, Work
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 
 PERIOD_S = 0.05  # between two looks at a process
+FILES = 4  # of a recording
 
 
 @dataclass(frozen=True)
@@ -44,14 +46,13 @@ class Options:
     episodes: int = 10_000
     large: int = 800
     frames: int = 12
-    steps: int = 20
-    limit: int = 1_500_000_000
+    steps: int = 10
+    limit: int = 1_700_000_000
     folder: str = ''
 
 
 def run(args):
-    """Write each recording, measure what is done with it, remove it; return rows."""
-    rows = []
+    """Write each recording, measure what is done with it, remove it."""
     for count, side, batch in ((args.episodes, 64, 24), (args.large, 256, 2)):
         with tempfile.TemporaryDirectory(dir=args.folder or None) as folder:
             bag = Path(folder, 'bag')
@@ -61,25 +62,32 @@ def run(args):
                 str(batch), '--out', str(Path(folder, 'run'))]
             found = [measure(command, Path(folder, 'cache'), args.limit)
                      for command in (inspect, inspect, train)]
-            rows += show([Row(
+            yield Row(
                 f'inspect, again, train {args.steps} steps of {batch}: {count:,} episodes of '
                 f'{args.frames} frames of {side} px', '; '.join(
                     f'{seconds:.0f} s, {memory / 1e6:,.0f} MB' for seconds, memory in found),
                 max(memory for _, memory in found) / written,
                 f'the recording, {written / 1e9:.1f} GB',
                 f'within {args.limit / 1e9:g} GB', written > args.limit,
-                'the size of the recording')])
-    return rows
+                'the size of the recording')
 
 
 def write(bag, count, side, frames):
-    """Write a recording of one file; return its bytes."""
+    """Write a recording, its files at the same time; return its bytes."""
     bag.mkdir()
-    with EpisodeWriter(bag / 'bag_0.mcap', 'none') as writer:
-        for seed in range(count):
-            writer.write(make_episode(seed, side, frames))
+    for _, get in run_tasks([Work(f'file {number}', write_file, (
+            bag / f'bag_{number}.mcap', range(number, count, FILES), side, frames))
+                             for number in range(FILES)]):
+        get()
     write_metadata(bag)
-    return (bag / 'bag_0.mcap').stat().st_size
+    return sum(file.stat().st_size for file in bag.glob('*.mcap'))
+
+
+def write_file(file, seeds, side, frames):
+    """Write a file of a recording."""
+    with EpisodeWriter(file, 'none') as writer:
+        for seed in seeds:
+            writer.write(make_episode(seed, side, frames))
 
 
 def measure(command, cache, limit):

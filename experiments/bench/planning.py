@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import time
 
 from experiments.bench.mppi import mppi
-from experiments.bench.rows import Row, show
+from experiments.bench.rows import Row
 from experiments.planning.methods import FIRST_SCENE, with_samples
 import numpy as np
 from sim_bridge.simulator import Simulator
@@ -44,27 +44,26 @@ class Options:
 
 
 def run(args):
-    """Print the times of plans of each preset, and what the solvers find; return rows."""
-    simulator = Simulator('push2')
+    """Time plans of each preset, and say what the solvers find."""
+    simulator = Simulator('push2', 64)
     seen = simulator.reset(FIRST_SCENE)
     goal = simulator.goal().object_pixels
     planners = {name: VisualMPC.load(args.weights, with_preset(name), args.device)
                 for name in PRESETS if name != 'paper'}
     pushing = push_until_low(simulator, planners['large'], goal)
-    rows = []
     for name, mpc in planners.items():
         search = mpc.config.search
         for when, scene, warm in (('at the start', seen, False), ('while pushing', pushing, True)):
             times, predicting = time_plans(mpc, scene, goal, args.plans, warm)
             seconds = np.median(times) / 1000
             steps = search.num_samples * search.num_iterations * HORIZON
-            rows += show([Row(
+            yield Row(
                 f'plan, preset `{name}`, {when}', f'{seconds:.2f} s, {1e6 * seconds / steps:.0f} '
                 'us a sample-step', times.sum() / predicting.sum(), 'its predictions alone',
                 *(('at most 0.5 s', seconds <= AIM_S) if name == 'large' else ()),
-                limit=where_time_goes(mpc.model, scene) if name == 'large' else '')])
+                limit=where_time_goes(mpc.model, scene) if name == 'large' else '')
     simulator.close()
-    return rows + show(compare_solvers(args))
+    yield from compare_solvers(args)
 
 
 def push_until_low(simulator, mpc, goal, most=30):
@@ -126,7 +125,7 @@ def compare_solvers(args):
     """Return rows: what other solvers and fewer samples find beside CEM, in first plans."""
     default = with_preset('default')
     num_samples, few = default.search.num_samples, default.search.num_samples // 3
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     scenes = [(seed, as_scene(simulator.reset(seed)), simulator.goal().object_pixels)
               for seed in range(FIRST_SCENE, FIRST_SCENE + args.scenes)]
     simulator.close()

@@ -17,7 +17,7 @@ import tempfile
 import time
 
 import cv2
-from experiments.bench.rows import Row, show
+from experiments.bench.rows import Row
 from mcap.reader import make_reader
 import numpy as np
 from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE, TOPICS
@@ -47,8 +47,7 @@ class Options:
 
 
 def run(args):
-    """Print frames per second, and how long a bag of JPEG pictures takes to open; return rows."""
-    rows = []
+    """Count frames per second, and time how long a bag of JPEG pictures takes to open."""
     with tempfile.TemporaryDirectory() as folder:
         for compression in ('none', 'zstd'):
             paths, frames = write_files(Path(folder), compression, args.episodes, args.files)
@@ -62,12 +61,11 @@ def run(args):
                     if seen != frames:
                         raise RuntimeError(f'{contender.__name__} saw {seen} of {frames} frames')
             ours, theirs = best.values()
-            rows += show([Row(
+            yield Row(
                 f'open a recording of 64 px, compression {compression}, first time',
                 f'{frames / ours:,.0f} frames/s', theirs / ours,
-                'the rate of mcap and rosbags alone')])
-        rows += show([_open_pictures(Path(folder) / 'jpeg')])
-    return rows
+                'the rate of mcap and rosbags alone')
+        yield _open_pictures(Path(folder) / 'jpeg')
 
 
 def _open_pictures(folder):

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a benchmark measured, as rows of docs/speed.md."""
+"""What a benchmark measured, as a row of docs/speed.md."""
 
 from dataclasses import dataclass
 
@@ -24,10 +24,8 @@ class Row:
         return self.what, self.here, f'{self.ratio:.2f} x {self.to}', aim, self.limit
 
 
-def show(rows):
-    """Print rows, and return them; one that misses its aim has to say what limits it."""
-    for row in rows:
-        if not (row.reached or row.limit):
-            raise ValueError(f'{row.what}: misses {row.aim}, and nothing says why')
-        print('; '.join(filter(None, row.cells)).replace('*', ''), flush=True)
-    return rows
+def show(row):
+    """Print a row; one that misses its aim has to say what limits it."""
+    if not (row.reached or row.limit):
+        raise ValueError(f'{row.what}: misses {row.aim}, and nothing says why')
+    print('; '.join(filter(None, row.cells)).replace('*', ''), flush=True)

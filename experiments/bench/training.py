@@ -12,7 +12,7 @@ import tempfile
 import time
 from typing import Annotated
 
-from experiments.bench.rows import Row, show
+from experiments.bench.rows import Row
 from experiments.paper.methods import method_fields
 from tap_ros.base.options import Bags
 from tap_ros.training.predictor import train
@@ -65,11 +65,11 @@ class Cost:
 
 
 def run(args):
-    """Train in each way for some steps, and print how fast that was; return rows."""
+    """Train in each way for some steps, and say how fast that was."""
     device = pick_device(args.device)
     if args.threads:
         torch.set_num_threads(args.threads)
-    rows, efficiencies = [], []
+    efficiencies = []
     for row in (*LADDER, *map(method_fields, args.methods)):
         with tempfile.TemporaryDirectory() as folder:
             config = TrainingConfig(**{
@@ -85,12 +85,11 @@ def run(args):
             aim = (f'at least {AIM} times', ratio >= AIM,
                    f'bfloat16 makes {ratio * efficiencies[0] / efficiencies[SAME]:.2f} x of it')
         network = f'{config.decoder} decoder{" with skips" * config.skips}'
-        rows += show([Row(
+        yield Row(
             f'train a predictor, `{config.method}`, {network}, '
             f'{pick_precision(config.precision, device)}',
             f'{args.batch_size / cost.seconds:.0f} samples/s', ratio,
-            'the first row, by CPU time', *aim)])
-    return rows
+            'the first row, by CPU time', *aim)
 
 
 def time_step(config, steps):

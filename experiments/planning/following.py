@@ -8,14 +8,13 @@ from functools import lru_cache
 import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.looks import LOOKS
-from tap_ros.base.contract import LOST
+from tap_ros.base.contract import CAMERA_SIZE, LOST
 from tap_ros.base.errors import TrackingError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.images.robot_mask import nearest_free
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.protocols import View
 
-CAMERA_SIZE = 256  # px, what objects are followed in
 SLIP = 5.0  # px of it, up to which a click is off the middle of an object
 CLICKS = 5  # at most
 _camera = lru_cache(Simulator)  # takes the pictures that objects are followed in

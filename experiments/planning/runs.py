@@ -205,7 +205,7 @@ def run_scene(job, seed):
 def make_episode(job, seed):
     """Run a job on one scene; return the PlannedEpisode or StackedEpisode."""
     torch.set_num_threads(1)  # with more, the predictor's last digits differ
-    simulator = _simulator(job.task, look=job.look)
+    simulator = _simulator(job.task, 64, job.look)
     predictor = _predictor(job.predictor, job.device) if job.predictor else None
     if job.stacks:
         return stack(simulator, job.method, seed, predictor)

@@ -236,5 +236,38 @@ def page(rows):
     for kind, lines in tables.items():
         lines['found'] = {'task': '**found**', FRAMES: ''} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
-    return render('worlds/templates/worlds.md.j2', marked=MARKED, **{
+    return render('worlds/templates/worlds.md.j2', marked=MARKED, more=compare(rows), **{
         kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})
+
+
+def compare(rows):
+    """
+    Compare three pictures with two, over the tasks with several trainings of both.
+
+    :return: dict: tasks, how many; hit and near, in words the mean difference in points with its
+        interval over the tasks, whose demonstrations and marks both had; alone, those of the
+        tasks that differ by themselves. There intervals are by Newcombe's square-and-add, as if
+        the two had not seen the same demonstrations.
+    """
+    two, three = ({row['task']: row for row in rows
+                   if row['method'] == method and row.get('seeds', 0) > 1}
+                  for method in WITH_MARKS)
+    found, alone = {'tasks': len(three)}, []
+    for name in ('hit', 'near'):
+        gains = [_less(three[task][name], two[task][name]) for task in three]
+        found[name] = _in_points(mean_interval([gain.value for gain in gains]))
+        alone += [f'{task.rpartition("/")[2]} {_in_points(gain)}'
+                  for task, gain in zip(three, gains) if gain.low > 0 or gain.high < 0]
+    return found | {'alone': alone}
+
+
+def _less(one, other):
+    value = one['value'] - other['value']
+    return Interval(value, value - np.hypot(one['value'] - one['low'],
+                                            other['high'] - other['value']),
+                    value + np.hypot(one['high'] - one['value'], other['value'] - other['low']))
+
+
+def _in_points(gain):
+    value, low, high = (f'{round(100 * each):+d}' for each in gain)
+    return f'{value} ({low} to {high})'

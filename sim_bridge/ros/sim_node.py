@@ -20,7 +20,7 @@ from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode
 from tap_msgs.srv import ResetScene, SetGoal, StepScene
-from tap_ros.base.contract import CONTROL_PERIOD, SPEED_LIMIT, WORLD_FRAME
+from tap_ros.base.contract import CAMERA_SIZE, CONTROL_PERIOD, SPEED_LIMIT, WORLD_FRAME
 from tap_ros.base.errors import TapError
 from tap_ros.messages import topics
 from tap_ros.messages.objects import decode_objects
@@ -323,7 +323,7 @@ class SimParameters:
     world: str = setting('mujoco_table', plugins='tap_ros.worlds')
     task: str = 'push2'
     seed: int = setting(0, between=(0, 2**62))
-    image_size: int = setting(64, between=(16, 1024))
+    image_size: int = setting(CAMERA_SIZE, between=(16, 1024))
     look: str = setting(DEFAULT_LOOK, choices=tuple(LOOKS))
     arm: str = setting(DEFAULT_ARM, plugins='tap_ros.arms')
     appearance: str = setting('usual', choices=tuple(CHOICES))

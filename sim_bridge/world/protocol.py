@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.base.contract import ACTION_LIMIT
+from tap_ros.base.contract import ACTION_LIMIT, CAMERA_SIZE
 from tap_ros.base.errors import SceneError
 from tap_ros.base.plugins import load_plugin
 from tap_ros.robots.arm import Arm
@@ -95,7 +95,7 @@ class World(Protocol):
         """Free what the world holds; it cannot be used after that."""
 
 
-def make_world(name: str, task: str, image_size: int = 64, **options: Any) -> World:
+def make_world(name: str, task: str, image_size: int = CAMERA_SIZE, **options: Any) -> World:
     """
     Make a world.
 

@@ -23,6 +23,7 @@ from sim_bridge.world.scene import (
 )
 from sim_bridge.world.studio import Studio
 from tap_ros.base.contract import (
+    CAMERA_SIZE,
     CONTROL_PERIOD,
     object_names,
     WORKSPACE_HIGH,
@@ -91,8 +92,9 @@ class Table(OneCamera):
 
     goal_poses: np.ndarray
 
-    def __init__(self, image_size: int = 64, gripping: bool = False, look: str = DEFAULT_LOOK,
-                 appearance: str = 'usual', arm: str = DEFAULT_ARM) -> None:
+    def __init__(self, image_size: int = CAMERA_SIZE, gripping: bool = False,
+                 look: str = DEFAULT_LOOK, appearance: str = 'usual',
+                 arm: str = DEFAULT_ARM) -> None:
         self.look, self.arm = get_look(look), get_arm(arm)
         if not 16 <= image_size <= 1024:
             raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')

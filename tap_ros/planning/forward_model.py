@@ -15,9 +15,7 @@ The flow warps the first picture's object layer and its mask, and by the very sa
 maps: p_t(x) ~ p_0(x + phi_t(x)). Pictures are only composed in training, as
 arm over warped objects over background, three masks that sum to 1.
 
-Unlike the authors' ConvLSTM, nothing is decoded per step, and the arm, whose motion is commanded,
-is not predicted but drawn where its kinematics put it; made for pictures without the robot, it
-draws none.
+Unlike the authors' ConvLSTM, it decodes nothing per step, and draws the arm by its kinematics.
 """
 
 from collections.abc import Iterator
@@ -68,8 +66,7 @@ class ForwardModelConfig:
     blocks: int = 3
     encoder_width: int = 16
     sprite_size: int = 24  # pixels, side of the picture of the arm
-    # what the pictures are without, see robot_mask.hidden_pixels
-    robot_mask: RobotMask = 'none'
+    robot_mask: RobotMask = 'none'  # what the pictures are without
     crop: str = ''  # of the camera's pictures, see crop.Crop
     crop_size: int = 0  # Crop.size
     camera_size: tuple[int, int] = (0, 0)  # (0, 0): unknown

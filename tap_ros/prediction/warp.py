@@ -9,6 +9,7 @@ A flow (du, dv) in pixels at pixel (u, v) says that the output there is read fro
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch.nn import functional
@@ -40,14 +41,23 @@ def warp(images: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
     :return: (B, C, channels, H, W). Positions outside the picture read its border.
     """
     B, C, _, H, W = flow.shape
-    u = torch.arange(W, device=flow.device, dtype=flow.dtype)
-    v = torch.arange(H, device=flow.device, dtype=flow.dtype)
-    # With align_corners -1 and 1 are the centres of the outermost pixels.
-    grid = torch.stack([(flow[:, :, 0] + u) * (2 / (W - 1)) - 1,
-                        (flow[:, :, 1] + v[:, None]) * (2 / (H - 1)) - 1], -1)  # B, C, H, W, 2
-    warped = functional.grid_sample(images.flatten(0, 1), grid.flatten(0, 1), mode='bilinear',
+    here, scale = _pixels(H, W, flow.dtype, flow.device)
+    # With align_corners -1 and 1 are the centres of the outermost pixels. Fastest on a CPU where
+    # all u lie together, and all v.
+    grid = ((flow.flatten(0, 1).contiguous() + here) * scale - 1).movedim(1, -1)  # B*C, H, W, 2
+    warped = functional.grid_sample(images.flatten(0, 1), grid, mode='bilinear',
                                     padding_mode='border', align_corners=True)
     return warped.unflatten(0, (B, C))
+
+
+@lru_cache(8)
+@torch.inference_mode(False)
+def _pixels(H: int, W: int, dtype: torch.dtype,
+            device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return (u, v) of each pixel, (2, H, W), and the scale of both for a grid, (2, 1, 1)."""
+    v, u = (torch.arange(side, device=device, dtype=dtype) for side in (H, W))
+    return (torch.stack([u.expand(H, W), v[:, None].expand(H, W)]),
+            torch.tensor([2 / (W - 1), 2 / (H - 1)], device=device, dtype=dtype)[:, None, None])
 
 
 def combine(warped: torch.Tensor, masks: torch.Tensor,
@@ -78,18 +88,20 @@ def one_hot_maps(pixels: torch.Tensor, size: Sequence[int]) -> torch.Tensor:
     """
     H, W = size
     pixels = pixels.float()
+    here, _ = _pixels(H, W, pixels.dtype, pixels.device)
     u = pixels[..., 0].clamp(0, W - 1)[..., None]
     v = pixels[..., 1].clamp(0, H - 1)[..., None]
-    along_u = (1 - (u - torch.arange(W, device=pixels.device)).abs()).clamp(min=0)  # ..., W
-    along_v = (1 - (v - torch.arange(H, device=pixels.device)).abs()).clamp(min=0)  # ..., H
+    along_u = (1 - (u - here[0, 0]).abs()).clamp(min=0)  # ..., W
+    along_v = (1 - (v - here[1, :, 0]).abs()).clamp(min=0)  # ..., H
     return along_v[..., :, None] * along_u[..., None, :]
 
 
 def expected_pixels(maps: torch.Tensor) -> torch.Tensor:
     """Return the mean position (..., 2), (u, v), under each map (..., H, W) that sums to 1."""
     H, W = maps.shape[-2:]
-    u = maps.sum(-2) @ torch.arange(W, device=maps.device, dtype=maps.dtype)
-    v = maps.sum(-1) @ torch.arange(H, device=maps.device, dtype=maps.dtype)
+    here, _ = _pixels(H, W, maps.dtype, maps.device)
+    u = maps.sum(-2) @ here[0, 0]
+    v = maps.sum(-1) @ here[1, :, 0].contiguous()
     return torch.stack([u, v], -1)
 
 
@@ -113,16 +125,25 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
     :return: WarpedMaps.
     """
     flow, masks = flow[:, :maps.shape[1]], masks[:, :maps.shape[1]]
-    candidates = [combine(warp(maps, flow), masks)]  # B, K, H, W
-    mass = candidates[0].sum((-2, -1))
-    if bool((mass < MIN_MASS).any()):
-        candidates += [combine(warp(blur(maps), flow), masks), *maps[:, 2:].unbind(1),
-                       combine(maps, masks), maps.mean(1)]
-    warped = candidates[-1]
+    warped = combine(warp(maps, flow), masks)  # B, K, H, W
+    kept = mass = warped.sum((-2, -1))
+    if bool((lost := mass < MIN_MASS).any()):
+        b, k = lost.nonzero(as_tuple=True)
+        warped[b, k] = _found(maps[b, :, k], flow[b], masks[b])
+        kept = warped.sum((-2, -1))
+    return WarpedMaps(warped / kept[..., None, None], mass)
+
+
+def _found(maps: torch.Tensor, flow: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
+    """Say where N objects are, (N, H, W), whose maps (N, C, H, W) got lost in the warp."""
+    maps = maps[:, :, None]
+    candidates = [combine(warp(blur(maps), flow), masks), *maps[:, 2:].unbind(1),
+                  combine(maps, masks), maps.mean(1)]
+    found = candidates[-1]
     for candidate in reversed(candidates[:-1]):
         kept = candidate.sum((-2, -1), keepdim=True) >= MIN_MASS
-        warped = torch.where(kept, candidate, warped)
-    return WarpedMaps(warped / warped.sum((-2, -1), keepdim=True), mass)
+        found = torch.where(kept, candidate, found)
+    return found[:, 0]
 
 
 def blur(maps: torch.Tensor) -> torch.Tensor:

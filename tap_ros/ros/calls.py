@@ -29,6 +29,17 @@ class NotYet(CallError):
     """A service refused what it may do later: ask again."""
 
 
+def countdown(what: str, seconds: float) -> Callable[[], float]:
+    """Return a function that tells how many seconds are left; CallError once there are none."""
+    deadline = time.monotonic() + seconds
+
+    def left() -> float:
+        if (found := deadline - time.monotonic()) <= 0:
+            raise CallError(f'{what}: not done within {seconds:g} s')
+        return round(found, 2) or found  # as errors print it
+    return left
+
+
 def log_error(node: Node, what: str, error: BaseException) -> None:
     """Log an error in one line; an unexpected one, that is no TapError, with its traceback."""
     lines = [escaped(error, 1000)] if isinstance(error, TapError) else [

@@ -27,7 +27,7 @@ from tap_msgs.srv import PredictSubgoal, ResetScene, SelectObjects, SetGoal, Ste
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.text import escaped, listing
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.ros.calls import call, CallError, NotYet, Spinner
+from tap_ros.ros.calls import call, CallError, countdown, NotYet, Spinner
 from tap_ros.ros.goal_senders import CLIENT
 from tap_ros.ros.heartbeat import Liveness
 from tap_ros.ros.observations import Observations
@@ -160,12 +160,12 @@ class Client:
         """
         seconds, client = self._timeout(timeout_s), self._service(service)
         kind, _, server = SERVICES[service]
-        response = call(client, make_request(kind.Request, fields), seconds, give_up,
-                        self._liveness(server))
+        response = call(
+            client, make_request(kind.Request, fields), seconds, give_up, self._liveness(server))
         if not getattr(response, 'success', True):
             reason = getattr(response, 'message', 'the log of its node says why')
-            error = NotYet if reason.startswith(WAITING) else CallError
-            raise error(f'{client.service_name} refused: {escaped(reason, 1000)}')
+            raise (NotYet if reason.startswith(WAITING) else CallError)(
+                f'{client.service_name} refused: {escaped(reason, 1000)}')
         return response
 
     # Subgoals and goals
@@ -190,7 +190,7 @@ class Client:
         :raises CallError: when the node does not answer in time, leaves the ROS graph, or refuses.
         :raises ConfigError: for pictures of another type or shape, and numbers out of range.
         """
-        left = _countdown('predict', self._timeout(timeout_s))  # encoding takes its time
+        left = countdown('predict', self._timeout(timeout_s))  # encoding takes its time
         fields = request_fields(
             start=start, goal=goal, start_objects=start_pixels, goal_objects=goal_pixels)
         response = self.call(
@@ -255,11 +255,11 @@ class Client:
         """
         Start a scene in the simulator.
 
-        :param objects: wait for the objects, too; not where they are yet to be selected.
+        :param objects: wait for them, too; not where they are yet to be selected.
         :return: the first view of the camera, and the goal.
         :raises CallError: when the simulator refuses, or shows nothing.
         """
-        left = _countdown('reset', self.timeout_s)
+        left = countdown('reset', self.timeout_s)
         scene: dict[str, Any] = {'task': task, 'seed': seed, 'hide_arm': hide_arm}
         make_request(ResetScene.Request, scene)  # raises before anything is waited for
         self._observed('goal')  # before something comes
@@ -349,14 +349,3 @@ class Client:
 
     def _timeout(self, timeout_s: float | None) -> float:
         return self.timeout_s if timeout_s is None else seconds_of(timeout_s)
-
-
-def _countdown(what: str, seconds: float) -> Callable[[], float]:
-    """Return a function that tells how many seconds are left; CallError once there are none."""
-    deadline = time.monotonic() + seconds
-
-    def left() -> float:
-        if (found := deadline - time.monotonic()) <= 0:
-            raise CallError(f'{what}: not done within {seconds:g} s')
-        return round(found, 2) or found  # as errors print it
-    return left

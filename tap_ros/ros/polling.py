@@ -26,6 +26,7 @@ from tap_ros.base.text import escaped
 from tap_ros.ros.topics import SERVICE_QOS
 
 WAIT_NS = 5 * 10**7  # after which a thread looks whether its node ends, or has more to wait for
+MAX_TAKEN = 100  # requests before some are answered
 
 
 class PollOnlyGroup(CallbackGroup):
@@ -93,11 +94,14 @@ class DeferredService:
 
     :param take: called with each request and a function that sends its response; that function
         has to be called exactly once.
+    :param work: called by the thread each time when it has taken what had come; returns whether
+        there is more to do.
     """
 
     def __init__(self, node: Node, service_type: Any, name: str,
-                 take: Callable[[Any, Callable[[Any], object]], object]) -> None:
-        self._node, self._take = node, take
+                 take: Callable[[Any, Callable[[Any], object]], object],
+                 work: Callable[[], bool] = lambda: False) -> None:
+        self._node, self._take, self._work = node, take, work
         self._service = node.create_service(
             service_type, name, lambda _, response: response, qos_profile=SERVICE_QOS,
             callback_group=PollOnlyGroup())
@@ -128,11 +132,15 @@ class DeferredService:
             f'{self._service.srv_name}: {type(error).__name__}: {escaped(error)}')
 
     def _run(self) -> None:
-        context = self._node.context
+        context, more = self._node.context, False
         while not self._ended.is_set() and context.ok():
             try:
-                if wait_for_some(context, [self._service]):
-                    self._take_one()
+                if more or wait_for_some(context, [self._service]):
+                    more = False  # should something fail
+                    for _ in range(MAX_TAKEN):
+                        if not self._take_one():
+                            break
+                    more = self._work()
             except Exception as error:
                 if context.ok():
                     self._log(error)

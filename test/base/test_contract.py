@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def simulator(request):
-    simulator = Simulator(getattr(request, 'param', 'push2'))
+    simulator = Simulator(getattr(request, 'param', 'push2'), 64)
     yield simulator
     simulator.close()
 

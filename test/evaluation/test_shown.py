@@ -15,7 +15,7 @@ CARRYING = 8  # a frame in which the hand is at the object
 
 @pytest.fixture(scope='module')
 def episode():
-    return Simulator('pick_place', look='hand').demonstrate(3).episode
+    return Simulator('pick_place', 64, 'hand').demonstrate(3).episode
 
 
 def test_the_matched_frame_shows_all_and_the_one_without_the_hand_no_hand(episode):

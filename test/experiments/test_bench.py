@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benchmarks measure what they say."""
 
+from dataclasses import dataclass
 import mmap
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
-from experiments.bench import growth, recording
+from experiments import tables
+from experiments.bench import everything, growth, recording
 from experiments.bench.mppi import mppi
 from experiments.bench.rows import Row, show
 import numpy as np
@@ -22,7 +25,7 @@ def test_all_frames_are_opened_beside_another_job(monkeypatch):
     assert '20 JPEG frames' in pictures.what and pictures.reached
     monkeypatch.setattr(recording, 'build_cache', lambda paths, scratch: 1)
     with pytest.raises(RuntimeError, match='saw 1 of'):
-        recording.run(args)
+        list(recording.run(args))
 
 
 def test_memory_is_what_is_held_beside_mapped_files(tmp_path):
@@ -69,9 +72,52 @@ def test_work_is_done_in_turns_alone_and_beside_others():
 
 def test_a_row_that_misses_its_aim_says_why():
     with pytest.raises(ValueError, match='a plan: misses at most 1 s'):
-        show([Row('a plan', '2 s', 2.0, 'its predictions', 'at most 1 s', False)])
-    row, = show([Row('a plan', '2 s', 2.0, 'its predictions', 'at most 1 s', False, 'all of it')])
+        show(Row('a plan', '2 s', 2.0, 'its predictions', 'at most 1 s', False))
+    show(row := Row('a plan', '2 s', 2.0, 'its predictions', 'at most 1 s', False, 'all of it'))
     assert row.cells[-2:] == ('**missed**: at most 1 s', 'all of it')
+
+
+def test_rows_are_kept_as_they_are_measured_and_what_was_interrupted_goes_on(
+        tmp_path, monkeypatch):
+    @dataclass(frozen=True)
+    class Options:
+        end: str = 'c'
+
+    def run(options):
+        for what in 'abc':
+            if what == fails:
+                raise KeyboardInterrupt
+            yield Row(what, '1 s', 1.0, 'itself', 'at most 2 s')
+
+    def kept(key='commit'):
+        assert tables.filled('speed') == page.read_text()
+        return {row['what']: row[key] for row in tables.measured_speed()['rows']}
+
+    page = tmp_path / 'speed.md'
+    page.write_text('<!-- table -->\n<!-- end -->\n')
+    (tmp_path / 'speed.json').write_text('{"rows": [], "unfinished": []}')
+    monkeypatch.setattr(tables, 'SPEED', tmp_path / 'speed.json')
+    monkeypatch.setattr(tables, 'page_path', lambda name: page)
+    part = SimpleNamespace(Options=Options, run=run)
+    monkeypatch.setattr(everything, 'module', lambda name: part)
+    made = {'machine': 'one', 'date': 'today', 'commit': '1', 'torch': '2'}
+    monkeypatch.setattr(everything, 'made_by', lambda: made)
+    fails = ''
+    everything.measure('start', Options())
+    everything.measure('busy', Options(end='d'))  # not the default: printed alone
+    assert kept() == {'a': '1', 'b': '1', 'c': '1'} and '| one |' in page.read_text()
+    assert everything.is_measured('start') and not everything.is_measured('busy')
+    made, fails = made | {'commit': '2'}, 'b'
+    assert not everything.is_measured('start')
+    with pytest.raises(KeyboardInterrupt):
+        everything.measure('start', Options())
+    assert kept() == {'a': '2', 'b': '1', 'c': '1'} and not everything.is_measured('start')
+    assert '| 1 |' in page.read_text()
+    fails = ''
+    everything.run(everything.Options())
+    assert kept() == {'a': '2', 'b': '2', 'c': '2'}
+    assert [row['part'] for row in tables.measured_speed()['rows']] == [
+        name for name in everything.PARTS for _ in 'abc']
 
 
 def test_mppi_goes_to_the_least_cost():

@@ -26,7 +26,7 @@ DIRECT, SHIPPED = parse_method('direct'), parse_method('shipped')
 
 @pytest.fixture(scope='module')
 def simulator():
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     yield simulator
     simulator.close()
 
@@ -75,7 +75,7 @@ class Witness:
 
 
 def test_networks_are_shown_what_nodes_would_show(mpc, predictor):
-    studio, robot_mask = Simulator('push2', look='hand'), 'all'
+    studio, robot_mask = Simulator('push2', 64, look='hand'), 'all'
     model = copy.copy(mpc.model)
     model.config = replace(model.config, robot_mask=robot_mask)
     seen_by_model, begin = [], model.begin

@@ -34,9 +34,9 @@ FOUND = {'metric': 'bottleneck_frequency_2px', 'new_pixels': False, 'mode': 'bid
 GAIN = {'metric': 'gain_over_fix', 'new_pixels': True, 'mode': 'bidirectional'}
 
 
-@pytest.mark.parametrize('page', ['prediction', 'planning', 'stacking'])
+@pytest.mark.parametrize('page', ['prediction', 'planning', 'stacking', 'speed'])
 def test_tables_are_made_from_the_data(page):
-    assert tables.filled(page) == (RESULTS / f'{page}.md').read_text()
+    assert tables.filled(page) == tables.page_path(page).read_text()
 
 
 def test_pages_are_made_from_the_data():

@@ -15,7 +15,7 @@ SEED = fullsize.FIRST_SCENE
 
 @pytest.fixture(scope='module')
 def camera():
-    camera = Simulator('push2', image_size=256)
+    camera = Simulator('push2')
     yield camera
     camera.close()
 

@@ -18,14 +18,14 @@ SEEDS = range(FIRST_SCENE, FIRST_SCENE + 4)
 
 @pytest.fixture(scope='module', params=STACKING_TASKS)
 def simulator(request):
-    simulator = Simulator(request.param)
+    simulator = Simulator(request.param, 64)
     yield simulator
     simulator.close()
 
 
 @pytest.fixture(scope='module')
 def tower():
-    simulator = Simulator('stack3')
+    simulator = Simulator('stack3', 64)
     yield simulator
     simulator.close()
 

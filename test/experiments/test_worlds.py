@@ -58,6 +58,19 @@ def test_bottlenecks_are_read_by_their_stamps(tmp_path):
     assert found.frames.shape[1:] == (64, 64, 3)
 
 
+def test_three_pictures_are_compared_with_two_over_tasks_of_several_trainings():
+    def row(task, method, value, seeds=3):
+        share = {'value': value, 'low': value - 0.1, 'high': min(value + 0.1, 1.0)}
+        return {'task': task, 'method': method, 'seeds': seeds, 'hit': share, 'near': share}
+
+    rows = [row('aside/a/one', 'marks', 0.5), row('aside/a/one', 'three pictures', 0.7),
+            row('a/two', 'marks', 0.9), row('a/two', 'three pictures', 0.8),
+            row('a/alone', 'marks', 0.1, 1), row('a/alone', 'three pictures', 0.9, 1)]
+    found = command.compare(rows)
+    assert found['tasks'] == 2 and found['hit'] == found['near'] == '+5 (-10 to +20)'
+    assert found['alone'] == ['one +20 (+6 to +34)'] * 2
+
+
 @pytest.mark.parametrize('task', ['drawer', 'cube-double', 'puzzle'])
 def test_oracles_of_ogbench_demonstrate_as_unsteadily_as_people_do(task, tmp_path):
     pytest.importorskip('ogbench')

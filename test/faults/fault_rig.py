@@ -17,7 +17,8 @@ from tap_ros.ros.subscriptions import publishers_of
 from tap_ros.ros.topics import STREAM
 
 CALL_S = 20.0
-SIM_MODES = {'lock-step': {'lock_step': True}, 'real': {'lock_step': False}}
+SIM_MODES = {name: {'lock_step': waits, 'image_size': 64}
+             for name, waits in (('lock-step', True), ('real', False))}
 
 
 class Rig:

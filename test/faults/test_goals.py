@@ -212,8 +212,8 @@ def test_scene(rig, trials, other):
             handle = rig.begin_moving(**(goal_fields() if trial % 2 else {
                 'mode': 'direct', 'step_budget': 1000}))
             if other:
-                process = NodeProcess('sim_node', rig.folder / 'other_sim.log', {'seed': 99},
-                                      ['-r __node:=other_sim'])
+                process = NodeProcess('sim_node', rig.folder / 'other_sim.log',
+                                      {'seed': 99, 'image_size': 64}, ['-r __node:=other_sim'])
                 stack.callback(process.end)
                 process.wait_for('ready')
             else:

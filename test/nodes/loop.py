@@ -136,7 +136,8 @@ def running_loop(folder):
         loop = Loop(node, folder)
         try:
             loop.start('recorder_node', folder=folder / 'bag')
-            loop.start('sim_node', lock_step='true', observer='true')
+            # no larger than networks see them, so that acts_like needs nobody to shrink them
+            loop.start('sim_node', lock_step='true', observer='true', image_size=64)
             loop.start('predictor_node')
             loop.start('visual_mpc_node', image_timeout=10.0, preset='quick')
             for process in loop.processes.values():
@@ -162,7 +163,7 @@ def acts_like(loop, method, weights, **fields):
     feedback = []
     loop.reset()
     result = loop.reached(feedback.append, seed=SEED, **fields)
-    sim = Simulator('push2')
+    sim = Simulator('push2', 64)
     mpc = VisualMPC.load(FORWARD_MODEL, with_preset('quick'))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -105,6 +105,7 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
         with Client('camera') as node:
             camera = Camera(node)
             page.wait_for_function('pictures.camera && state.tracker && state.camera.width')
+            assert page.evaluate('[pictures.camera.width, pictures.camera.height]') == [WIDE, HIGH]
             page.wait_for_selector('#step-objects[aria-current=step]')
             assert says(page, 'objects') == 'waits for objects: click on them'
             assert says(page, 'go') == 'needs objects: step 2'

@@ -32,7 +32,7 @@ def sim(tmp_path_factory):
     """Start a simulator that shows the arm, to people too."""
     process = NodeProcess(
         'sim_node', tmp_path_factory.mktemp('sim') / 'log.txt',
-        {'lock_step': 'true', 'seed': 3, 'look': 'arm', 'observer': 'true'})
+        {'lock_step': 'true', 'seed': 3, 'look': 'arm', 'observer': 'true', 'image_size': 64})
     yield process.wait_for('ready')
     process.end()
 

@@ -109,7 +109,7 @@ def test_everything_about_one_moment_has_the_same_stamp(rig):
     for topic in (rig.info, rig.objects, rig.joints):
         assert topic.wait(10).header.stamp == image.header.stamp
     assert rig.clock.wait(10).clock == image.header.stamp
-    assert decode_image(image, 'image', (64, 64)).std() > 5
+    assert decode_image(image, 'image', (256, 256)).std() > 5
     assert rig.objects.wait(1).source == ObjectStates.SOURCE_GROUND_TRUTH
     end, start = rig.marks[before:]
     assert (end.event, start.event) == (Episode.END, Episode.START)
@@ -147,7 +147,7 @@ def test_a_goal_that_is_moved_is_published_as_that_of_a_reset(rig):
     marks, taken = len(rig.marks), [to_nanoseconds(stamp)]
     sim = Simulator('push2')
     sim.reset(5)
-    for pixel in ((50.0, 20.0), (14.5, 44.25)):  # at the same moment, and yet told apart
+    for pixel in ((201.5, 81.5), (59.5, 178.5)):  # at the same moment, and yet told apart
         rig.client.set_goal({'object_1': pixel})
         image = rig.goal_image.wait(10, lambda m: to_nanoseconds(m.header.stamp) > taken[-1])
         taken.append(to_nanoseconds(image.header.stamp))
@@ -173,8 +173,8 @@ def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(rig):
     rig.reset(seed=5)
     *_, goal = rig.goal(rig.image.wait(10).header.stamp)
     second, count = goal.objects[1], rig.goal_image.count
-    for pixels, words in (({'object_1': (64, 30)}, 'object_1.*64.*63.5'),
-                          ({'object_1': (63, 10)}, 'object_1.* out of reach.* 0.35 m')):
+    for pixels, words in (({'object_1': (256, 120)}, 'object_1.*256.*255.5'),
+                          ({'object_1': (253, 41)}, 'object_1.* out of reach.* 0.35 m')):
         with pytest.raises(CallError, match=words):
             rig.client.set_goal(pixels)
     # Poses do not count: it stays where its pixel is.

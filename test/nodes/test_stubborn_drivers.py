@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """visual_mpc_node with an arm that refuses, and drivers that are late, silent or repeat."""
 
+import math
 import threading
 import time
+from types import SimpleNamespace
 
 from driven import Arm, first_pictures, goal_fields, TOPICS, World
 from processes import Client, LocalNode, until
@@ -14,7 +16,9 @@ import tap_ros
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.planning.reach import MOST_REFUSED
 from tap_ros.planning.visual_mpc import Scene
+from tap_ros.robots.ur10e import UR10E
 from tap_ros.ros.topics import LATCHED
+from test_frames import told
 
 pytestmark = pytest.mark.slow
 
@@ -148,3 +152,21 @@ def test_an_object_in_doubt_ends_the_goal_with_its_name(rig):
         result, moves = rig.reach(40, doubt)
         assert result.end == 'aborted' and 1 <= result.steps == moves < 40
         assert f'object_1 {"is " * (state == "unsure")}{state}' in result.message
+
+
+def test_an_arm_that_is_nowhere_or_comes_to_stand_elsewhere_is_moved_no_more(rig):
+    place = first_pictures()[0].gripper[:3]
+    rig.world.joints = dict(zip(UR10E.joints, map(float, UR10E.joints_at(place))))
+    rig.aborted('nothing tells where the arm stands')
+    frames = rig.planner.node._inputs._gripper._mount.__self__._frames  # needs no tf2_msgs
+    mount, turn = UR10E.mount, [0, 0, math.sin(UR10E.mount.yaw / 2), math.cos(UR10E.mount.yaw / 2)]
+
+    def stand(x):
+        frames._take(SimpleNamespace(transforms=[
+            told('world', 'base', (x, *mount.position[1:]), turn)]))
+
+    stand(mount.position[0])
+    assert until(lambda: rig.planner.node._inputs.look()[0])
+    result, moves = rig.reach(40, lambda _: stand(mount.position[0] + 0.1), 1.0)
+    assert result.end == 'aborted' and 1 <= moves < 40, result.message
+    assert 'restart the node if the arm was moved' in result.message

@@ -6,6 +6,7 @@ from driven import first_pictures, SEED, select
 from loop import Loop
 from processes import NodeProcess, until
 import pytest
+from tap_ros.base.contract import CAMERA_SIZE
 
 pytestmark = pytest.mark.slow
 PULLED = [word for topic in ('truth/objects', 'truth/goal/objects')
@@ -14,7 +15,7 @@ PULLED = [word for topic in ('truth/objects', 'truth/goal/objects')
 
 def test_clicks_and_a_goal_picture_are_enough(tmp_path, client):
     assert until(lambda: 'visual_mpc_node' not in client.get_node_names()), 'of an earlier test'
-    loop, (first, _) = Loop(client, tmp_path), first_pictures()
+    loop, (first, _) = Loop(client, tmp_path), first_pictures(CAMERA_SIZE)
     loop.processes['sim_node'] = NodeProcess('sim_node', tmp_path / 'sim.log', {
         'lock_step': True, 'seed': SEED, 'objects': 'tracked'}, PULLED)
     try:

@@ -63,7 +63,7 @@ def test_flow_and_masks_read_the_full_pictures_as_they_do_the_small_ones(context
 
 
 def test_an_answer_is_nearer_to_the_true_picture_than_a_small_one_enlarged():
-    predictor, camera = SubgoalPredictor.load('push2'), Simulator('push2', image_size=256)
+    predictor, camera = SubgoalPredictor.load('push2'), Simulator('push2')
     try:
         for seed in range(1_950_002, 1_950_005):
             start, goal = camera.reset(seed), camera.goal()

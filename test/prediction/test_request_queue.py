@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the queue of requests: each is answered once, whatever happens to the others."""
 
+from concurrent.futures import ThreadPoolExecutor
 import threading
 
 import pytest
@@ -25,11 +26,12 @@ class Rig:
             return work(batch)
 
         self.queue = RequestQueue(
-            lambda: slow, cost,
-            **{'max_waiting': 100, 'max_together': 8, 'max_cost': 100, **limits})
+            slow, cost, **{'max_waiting': 100, 'max_together': 8, 'max_cost': 100, **limits})
+        self.thread = ThreadPoolExecutor(1)
 
     def put(self, one):
         self.queue.put(one, lambda found: self._note(one, found))
+        self.thread.submit(self.queue.answer_batch)
 
     def _note(self, one, found):
         with self._answered:
@@ -60,6 +62,7 @@ def made():
     for rig in rigs:
         rig.go.set()
         rig.queue.close()
+        rig.thread.shutdown()
 
 
 def test_an_error_reaches_only_who_caused_it(made):

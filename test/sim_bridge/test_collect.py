@@ -24,7 +24,7 @@ SMALL = CollectConfig(episodes=3, episodes_per_file=1, seed=5, frames=12)
 
 @pytest.fixture(scope='module')
 def simulator():
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     yield simulator
     simulator.close()
 

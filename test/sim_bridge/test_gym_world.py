@@ -5,51 +5,16 @@
 from dataclasses import replace
 import json
 
+from examples.my_package.world import Dot
 import numpy as np
 import pytest
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from sim_bridge.demonstrations import demonstrate, find_bottleneck
-from sim_bridge.gym_world import GymWorld
 from sim_bridge.pushes import push_to_goal
-from sim_bridge.world.camera import Camera
 from sim_bridge.world.protocol import make_world
 from tap_ros.base.engines import Engine
 from tap_ros.base.errors import ConfigError, SceneError, TapError
 from tap_ros.recording.cache import open_recordings
-
-
-class Dot(GymWorld):
-    """One object that is wherever the fingertips are; its goal is 10 cm to the right."""
-
-    task_name, object_names, camera = 'dot', ('dot',), Camera(16, 16)
-
-    def begin(self, seed):
-        self.place = np.random.default_rng(seed).uniform(-0.1, 0.1, 3) * (1, 1, 0)
-        self.wanted = self.place + (0.1, 0, 0)
-
-    def move(self, target, opening):
-        self.place = target
-
-    def gripper(self):
-        return np.append(self.place, 1.0)
-
-    def object_poses(self):
-        return np.append(self.place, (0, 0, 0, 1))[None]
-
-    def goal_places(self):
-        return self.wanted[None]
-
-    def succeeds(self):
-        return np.linalg.norm(self.place - self.wanted) < 0.01
-
-    def draw(self):
-        return np.full((16, 16, 3), 9, np.uint8), np.zeros((16, 16), np.uint8)
-
-    def solve(self):
-        self.place = self.wanted
-
-    def close(self):
-        pass
 
 
 def test_an_environment_becomes_a_world_in_a_few_lines():

@@ -19,7 +19,7 @@ PLACES = np.array([[0.2, 0.1], [-0.15, -0.2]])
 
 @pytest.fixture(scope='module')
 def simulator():
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     yield simulator
     simulator.close()
 

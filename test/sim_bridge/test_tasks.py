@@ -2,18 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of tasks and their experts: grasping, stacking, pushing in order; and one that is added."""
 
-from dataclasses import dataclass
-from typing import ClassVar
-
+from examples.my_package.task import VISIT
 import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.motions import carry_out, Moment
+from sim_bridge.tasks.motions import Moment
 from sim_bridge.tasks.order import best_push, find_order
 from sim_bridge.tasks.stack import is_tower
-from sim_bridge.tasks.tasks import run_episode, sample_scene, Task, task_names, TaskScene
-from sim_bridge.world.scene import random_shape
+from sim_bridge.tasks.tasks import run_episode, sample_scene, task_names
 from tap_ros.base import plugins
 from tap_ros.base.contract import SUCCESS_DISTANCE
 from tap_ros.recording.cache import open_recordings
@@ -25,7 +22,7 @@ gripping = pytest.mark.parametrize('simulator', NUM_FRAMES, indirect=True)
 
 @pytest.fixture(scope='module')
 def simulator(request):
-    simulator = Simulator(request.param)
+    simulator = Simulator(request.param, 64)
     yield simulator
     simulator.close()
 
@@ -106,26 +103,8 @@ def test_the_wrong_order_fails_and_the_right_one_is_found_and_succeeds(simulator
     assert good.mean() > 0.6 and not bad.any() and np.mean(found) > 0.6
 
 
-@dataclass(frozen=True)
-class Visit(Task):
-    """Move the gripper to the left of the table; the object stays."""
-
-    kind: ClassVar[str] = 'visit'
-
-    def draw(self, rng, spread):
-        pose = np.array([[*rng.uniform(-0.1, 0.1, 2), 0.0]])
-        return TaskScene((random_shape(rng),), pose, pose, np.array([0.3, 0.3, 0.1]), (0,))
-
-    def succeeds(self, table):
-        return table.target[0] < -0.3
-
-    def demonstrate(self, table, scene, first, rng, how):
-        plans = (np.array([[-0.08, 0, 0, 0]]) for _ in range(self.num_frames))
-        return carry_out(table, self.succeeds, first, plans, how.num_frames or self.num_frames)
-
-
 def test_another_package_adds_a_task_in_a_few_lines(tmp_path, monkeypatch):
-    monkeypatch.setattr(plugins, 'visit', Visit('visit', 1, 10, stream=99), raising=False)
+    monkeypatch.setattr(plugins, 'visit', VISIT, raising=False)
     monkeypatch.setitem(plugins.BUILT_IN['tap_ros.tasks'], 'visit', 'tap_ros.base.plugins:visit')
     assert 'visit' in task_names()
     simulator = Simulator('visit')

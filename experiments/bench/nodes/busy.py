@@ -18,7 +18,7 @@ import time
 
 from experiments.bench import planning, recording, training
 from experiments.bench.nodes import service, start
-from experiments.bench.rows import Row, show
+from experiments.bench.rows import Row
 from experiments.planning.methods import FIRST_SCENE
 import numpy as np
 from sim_bridge.simulator import Simulator
@@ -57,13 +57,11 @@ class Work:
 
 
 def run(args):
-    """Print how much longer each work takes beside others; return rows."""
-    count, rows = args.spinning or CORES, []
+    """Measure how much longer each work takes beside others."""
     with contextlib.ExitStack() as stack:
         for work in works(stack):
             work.seconds()  # to warm up
-            rows += show([compare(work, args.pairs, count)])
-    return rows
+            yield compare(work, args.pairs, args.spinning or CORES)
 
 
 def compare(work, pairs, count):
@@ -88,7 +86,7 @@ def works(stack):
     paths, _ = recording.write_files(folder, 'none', 100, 1)
     yield Work('open 100 episodes', 1, partial(open_files, paths))
     yield Work('training step', 1, train_steps)
-    simulator = Simulator('push2')
+    simulator = Simulator('push2', 64)
     seen, goal = simulator.reset(FIRST_SCENE), simulator.goal().object_pixels
     simulator.close()
     mpc = VisualMPC.load(FORWARD_MODEL, with_preset('large'))

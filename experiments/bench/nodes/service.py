@@ -23,7 +23,7 @@ import threading
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
-from experiments.bench.rows import Row, show
+from experiments.bench.rows import Row
 import numpy as np
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
@@ -31,14 +31,12 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.apps.node_processes import NodeProcesses
 from tap_ros.nodes.predictor.requests import MAX_TOGETHER as TOGETHER
-from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.protocol import Request
 from tap_ros.ros.calls import call, CallError
 from tap_ros.ros.client import Client
 from tap_ros.ros.requests import request_fields
 from tap_ros.ros.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.weights import DEFAULT_PREDICTOR
-from tap_ros.weights.weights import save_weights
 
 PIXELS = np.array([[[20, 21], [40, 33]], [[30, 12], [44, 50]]], np.float32)  # start, goal
 TIMEOUT = 20.0  # s; a call that takes longer counts as lost
@@ -86,7 +84,7 @@ class Options:
 
 
 def run(args):
-    """Print the times of single calls, and what many clients get; return rows."""
+    """Time single calls, and count what many clients get."""
     with tempfile.TemporaryDirectory() as folder, NodeProcesses(folder) as nodes:
         nodes.start('predictor_node', weights=cut_weights(folder))
         with streaming(args.rate) as stream:
@@ -94,18 +92,18 @@ def run(args):
             alone, service, inside = (1e3 * np.median(times) for times in (
                 found.alone, found.service, found.inside))
             node = 1e3 * found.node
-            rows = show([Row(
+            yield Row(
                 'answer of `/predict_subgoal`', f'{service:.1f} ms, 99th percentile '
                 f'{1e3 * np.percentile(found.service, 99):.1f} ms', service / alone,
                 f'the model alone, {alone:.1f} ms', 'at most 1.2 times the model alone and 1 ms',
                 service <= 1.2 * alone + 1, f'the model there {inside:.1f} ms, what else the node '
-                f'does {node - inside:.1f} ms, DDS and client {service - node:.1f} ms')])
+                f'does {node - inside:.1f} ms, DDS and client {service - node:.1f} ms')
             small, large = (1e3 * np.median(times) for times in compare_sizes(
                 args.rounds, args.calls))
-            rows += show([Row(
+            yield Row(
                 'answer to pictures of 640x480, as large as their cut', f'{large:.1f} ms',
                 large / small, f'one to those of 64x64, {small:.1f} ms', 'at most 10 ms more',
-                large <= small + 10, 'messages of 2.5 MB there and back')])
+                large <= small + 10, 'messages of 2.5 MB there and back')
             gain = TOGETHER * np.median(found.alone) / np.median(found.together)
             first = None
             for count in args.clients:
@@ -113,20 +111,20 @@ def run(args):
                 load = measure_load(count, args.seconds)
                 spent = (nodes.cpu_s('predictor_node') - spent) / max(len(load.latencies), 1)
                 first = first or load.per_second
-                rows += show([Row(
+                yield Row(
                     f'answers to {count} clients', f'{load.per_second:.0f} a second, '
                     f'{load.counts["busy"]} told to come later, {load.counts["lost"]} lost',
                     load.per_second / first, f'{args.clients[0]} client',
                     *(('at least 3 times', load.per_second >= 3 * first) if count == 16 else ()),
                     limit=f'{TOGETHER} in a batch: {gain:.1f} x the model alone; CPU time of an '
                     f'answer: node {1e3 * spent:.1f} ms, clients {1e3 * load.cpu_s:.1f} ms'
-                    if count == 16 else '')])
+                    if count == 16 else '')
         nodes.check()
-    return rows
 
 
 def compare_latency(stream, rounds, calls):
     """Time the model alone and the service in turns, so many calls in a turn."""
+    from tap_ros.prediction.predictor import SubgoalPredictor  # here: clients begin without torch
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
     alike = Request(*pictures(), *PIXELS)
     alone, together, service, inside = [], [], [], []
@@ -266,6 +264,8 @@ def publish(rate):
 
 def cut_weights(folder):
     """Write the usual weights, as if of the middle of pictures of 640x480; return the file."""
+    from tap_ros.prediction.predictor import load_network  # here, as above
+    from tap_ros.weights.weights import save_weights
     network, _ = load_network(DEFAULT_PREDICTOR)
     file = Path(folder, 'predictor.safetensors')
     save_weights(file, network, 'predictor', network.config, {

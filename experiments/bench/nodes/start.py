@@ -7,7 +7,7 @@ import os
 import tempfile
 import time
 
-from experiments.bench.rows import Row, show
+from experiments.bench.rows import Row
 from tap_ros.apps.explorer import command
 from tap_ros.apps.node_processes import NodeProcesses
 
@@ -27,15 +27,15 @@ class Options:
 
 
 def run(args):
-    """Start all nodes, print when they were ready and what CPU time each took; return rows."""
+    """Start all nodes, say when they were ready and what CPU time each took."""
     found = [time_start() for _ in range(args.starts)]
     seconds, spent = min(found, key=lambda one: one[0])
     total = sum(spent.values())
-    return show([Row(
+    yield Row(
         'start of all nodes of `make explore`', f'{seconds:.1f} s',
         seconds / total * len(os.sched_getaffinity(0)), f'the CPU time, {total:.1f} s, on all '
         'cores', f'at most {AIM_S} s', seconds <= AIM_S, 'CPU time: ' + ', '.join(
-            f'{name} {each:.1f} s' for name, each in spent.items()))])
+            f'{name} {each:.1f} s' for name, each in spent.items()))
 
 
 def time_start():

@@ -36,14 +36,7 @@ from tap_ros.apps.demo.report import (
 )
 from tap_ros.apps.demo.watch import click, FOLLOWED_NO_MORE, Refused, right_order, Watch
 from tap_ros.apps.node_processes import errors_in, NodeProcesses
-from tap_ros.base.contract import (
-    CAMERA_SIZE,
-    DEFAULT_LOOK,
-    LOOKS,
-    ROBOT_MASKS,
-    step_budget,
-    TABLE,
-)
+from tap_ros.base.contract import DEFAULT_LOOK, LOOKS, ROBOT_MASKS, step_budget, TABLE
 from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.base.files import free_folder, write_atomically, write_rows
 from tap_ros.base.options import Folder, one_of
@@ -281,7 +274,7 @@ class NodeSet:
         args, table, subgoals = self._args, self._args.world == TABLE, self._mode == 'subgoal'
         namespace = '' if subgoals else f'/{self._mode}'
         world: dict[str, Any] = {'world': args.world} if not table else {
-            'look': args.look, 'arm': args.arm, 'observer': True, 'image_size': CAMERA_SIZE}
+            'look': args.look, 'arm': args.arm, 'observer': True}
         if args.tracked:
             world['objects'] = 'tracked'
         self._nodes, self._task = ExitStack(), task

@@ -7,7 +7,7 @@ import time
 from typing import Annotated
 
 from tap_ros.apps.node_processes import NodeProcesses
-from tap_ros.base.contract import CAMERA_SIZE, DEFAULT_LOOK, LOOKS
+from tap_ros.base.contract import DEFAULT_LOOK, LOOKS
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import free_folder
 from tap_ros.base.options import Folder, one_of
@@ -65,7 +65,7 @@ def start_nodes(processes: NodeProcesses, args: Options) -> None:
     """Start the simulator, what sees, predicts and plans, and the page."""
     # In lock-step a scene waits for those who look at it, however slow the machine is.
     processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,
-                    look=args.look, objects=args.objects, image_size=CAMERA_SIZE)
+                    look=args.look, objects=args.objects)
     if args.objects == 'tracked':
         processes.start('tracker_node')
     processes.start('predictor_node', weights=args.task if args.task in PREDICTORS

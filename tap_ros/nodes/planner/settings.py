@@ -46,8 +46,9 @@ class PlannerParameters:
         knows it, from the next goal on.
     :param max_step_z: Largest |dz| of a command in metres, 0.6 m/s at most; the planner
         knows it, from the next goal on.
-    :param goal_tolerance: A goal is reached at this mean distance of the objects in pixels, a
-        subgoal where the mean expected distance to its maps is so much above the least possible.
+    :param goal_tolerance: A goal is reached at this mean distance of the objects, in pixels of the
+        forward model's pictures, a subgoal where the mean expected distance to its maps is so much
+        above the least possible.
     :param switch: When to go on from a subgoal: when it is reached, or its share of the budget
         spent; or (half) then alone, as in the paper.
     :param subgoal_rounds: How often a goal in subgoal mode asks for subgoals: again, from what is

@@ -4,6 +4,7 @@
 
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 import time
@@ -52,8 +53,8 @@ class PredictorNode(LifecycleBase):
     Offers the service only once the weights are loaded, checked and warmed up.
 
     Without autostart it offers the service at once, and refuses requests until it is active. One
-    thread takes and checks the requests; another predicts what waits together, and sends the
-    answers.
+    thread takes and checks the requests that have come, predicts what goes together, and sends the
+    answers: two would wait for each other, and for Python's lock after every operator.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -75,7 +76,8 @@ class PredictorNode(LifecycleBase):
         self._unshown: deque[tuple[requests.PendingRequest, PredictedSubgoal]] = deque(maxlen=1)
         self._undrawn: tuple[requests.PendingRequest, PredictedSubgoal] | None = None
         steady_timer(self, SHOW_PERIOD, self._on_timer)
-        self._service = DeferredService(self, PredictSubgoal, 'predict_subgoal', self._on_request)
+        self._service = DeferredService(
+            self, PredictSubgoal, 'predict_subgoal', self._on_request, self._answer_batch)
         self.autostart('activate')
         self._service.start()
 
@@ -89,17 +91,16 @@ class PredictorNode(LifecycleBase):
     # Lifecycle
 
     def load(self) -> str:
-        """Load the weights, in the thread that will use them; return what is known of them."""
-        def prepare() -> Callable[[list[requests.PendingRequest]], list[Found]]:
-            # OpenMP is slow where two threads have begun parallel work on few cores.
-            check_device(self.params['device'])
-            self._predictor = load_predictor(self.params['weights'], self.params['device'])
-            return partial(predict, self._predictor)
-
+        """Load the weights; return what is known of them."""
+        check_device(self.params['device'])
+        # In a thread that ends, as it may run the network: OpenMP is slow where two threads have
+        # begun parallel work on few cores.
+        with ThreadPoolExecutor(1) as thread:
+            self._predictor = thread.submit(
+                load_predictor, self.params['weights'], self.params['device']).result()
         self._queue = RequestQueue(
-            prepare, lambda task: task.rows, requests.MAX_WAITING, requests.MAX_TOGETHER,
-            requests.MAX_ROWS)
-        assert self._predictor is not None
+            partial(predict, self._predictor), lambda task: task.rows, requests.MAX_WAITING,
+            requests.MAX_TOGETHER, requests.MAX_ROWS)
         mode, (height, width) = self._predictor.mode, self._predictor.image_size
         trained, share = trained_robot_mask(self._predictor.training)
         warn_if_unlike(self, self.params['robot_mask'], ['none'] * (share < 1)
@@ -152,7 +153,9 @@ class PredictorNode(LifecycleBase):
         except Exception as error:
             self._refuse(send, error)
 
-    # In the thread of the queue
+    def _answer_batch(self) -> bool:
+        queue = self._queue
+        return queue is not None and queue.answer_batch()
 
     def _answer(self, task: requests.PendingRequest, found: Found | Exception, send: Send,
                 begin: float) -> None:

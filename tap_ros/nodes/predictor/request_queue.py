@@ -1,10 +1,9 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests that wait, and the thread that answers what waits together."""
+"""Requests that wait, and are answered together."""
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 import threading
 import traceback
 from typing import Generic, TypeVar
@@ -21,34 +20,25 @@ class Busy(TapError):
 
 class RequestQueue(Generic[Request, Answer]):
     """
-    Answer requests in batches, in a thread of its own; every request is answered exactly once.
+    Answer requests in batches; every request is answered exactly once.
 
-    :param prepare: called first, in the thread, and waited for. It returns the work: a function
-        that is called in the same thread with a list of requests that waited, oldest first, and
-        returns their answers in the same order. If it fails for a batch, each request is tried
-        alone, so that only those get an error that cause it.
+    :param work: called with a list of requests that waited, oldest first; returns their answers
+        in the same order. If it fails for a batch, each request is tried alone, so that only those
+        get an error that cause it.
     :param cost: called with a request; how much of a batch it takes.
     :param max_waiting: most requests that wait; what comes beyond is refused at once.
     :param max_together: most requests in one batch.
     :param max_cost: most cost in one batch; a request that takes more goes alone.
-    :raises Exception: what `prepare` raises.
     """
 
-    def __init__(self, prepare: Callable[[], Callable[[list[Request]], Iterable[Answer]]],
+    def __init__(self, work: Callable[[list[Request]], Iterable[Answer]],
                  cost: Callable[[Request], float], max_waiting: int, max_together: int,
                  max_cost: float) -> None:
-        self._cost, self._max_waiting = cost, max_waiting
+        self._work, self._cost, self._max_waiting = work, cost, max_waiting
         self._max_together, self._max_cost = max_together, max_cost
         self._waiting: deque[tuple[Request, Callable[[Answer | Exception], object]]] = deque()
-        self._lock = threading.Lock()
+        self._lock, self._running = threading.Lock(), threading.Lock()
         self._closed = ''  # why
-        self._thread = ThreadPoolExecutor(1, 'request queue')
-        try:
-            self._work = self._thread.submit(prepare).result()
-        except BaseException:
-            # Interrupted: Python would abort if it ended while the thread is in C++.
-            self._thread.shutdown()
-            raise
 
     def __len__(self) -> int:
         """Return how many requests wait."""
@@ -59,8 +49,8 @@ class RequestQueue(Generic[Request, Answer]):
         Let a request wait for its answer.
 
         :param request: what the work takes.
-        :param answer: called once, in another thread, with what the work returned for the request,
-            or with the exception that it raised. What it raises itself is printed.
+        :param answer: called once, by answer_batch or close, with what the work returned for the
+            request, or with the exception that it raised. What it raises itself is printed.
         :raises Busy: when it cannot wait; `answer` is not called then.
         """
         with self._lock:
@@ -70,7 +60,6 @@ class RequestQueue(Generic[Request, Answer]):
                 raise Busy(f'busy: {len(self._waiting)} requests are waiting, which is the most '
                            'that may; ask again')
             self._waiting.append((request, answer))
-            self._thread.submit(self._answer_batch)
 
     def close(self, reason: str = 'the node is ending; ask again when it is back') -> None:
         """Answer what still waits with Busy, for this reason; return after the running batch."""
@@ -80,10 +69,16 @@ class RequestQueue(Generic[Request, Answer]):
             self._waiting.clear()
         for _, answer in left:
             answer(Busy(f'busy: {reason}'))
-        self._thread.shutdown()
+        with self._running:
+            pass
+
+    def answer_batch(self) -> bool:
+        """Answer the oldest requests, as many as go together; return whether others wait."""
+        with self._running:
+            self._answer_batch()
+        return bool(self._waiting)
 
     def _answer_batch(self) -> None:
-        """Answer the oldest requests, as many as go together."""
         batch: list[tuple[Request, Callable[[Answer | Exception], object]]] = []
         cost = 0.0
         with self._lock:
