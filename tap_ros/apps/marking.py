@@ -69,7 +69,8 @@ class Marking:
         known = type(episode) is int and episode in self.usable and isinstance(frames, list)
         if not known or not all(type(t) is int and 0 < t < self.store.lengths[episode] - 1
                                 for t in frames):  # True is an int, too
-            raise ConfigError('expected an episode and frames between its start and its goal')
+            raise ConfigError('the first frame is the start and the last one the goal; mark a '
+                              'frame between them')
         rising = sorted(set(frames))
         if frames and self.names and (frames != rising or len(frames) != len(self.names)):
             raise ConfigError(f'expected a frame for each of {listing(self.names)}, in this order')

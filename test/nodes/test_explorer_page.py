@@ -3,7 +3,7 @@
 """Laws of the explorer's page beside a camera, in a real browser, at a desk and on a phone."""
 
 from browsing import chromium, hidden_or_over, needs_browser, opened
-from geometry_msgs.msg import Point32, Polygon
+from geometry_msgs.msg import Point, Point32, Polygon
 import numpy as np
 from processes import Client, LocalNode, until
 import pytest
@@ -13,11 +13,13 @@ from tap_msgs.srv import SelectObjects
 from tap_ros.apps.explorer.node import ExplorerNode
 from tap_ros.base.contract import CAMERA_FRAME
 from tap_ros.ros.topics import encode_image, encode_objects, STREAM, to_stamp
+from visualization_msgs.msg import ImageMarker
 
 pytestmark = [pytest.mark.slow, needs_browser]
 WIDE, HIGH = 320, 240
 DESK, PHONE = (1280, 800), (390, 844)
 CUP, RING = (60.0, 80.0), (250.0, 190.0)
+OUTLINE, TURNED = ((-9.0, -9.0), (9.0, -9.0), (0.0, 9.0)), ((9.0, -9.0), (9.0, 9.0), (-9.0, 0.0))
 LIVE = """() => [...document.querySelectorAll('button:enabled')].filter(
     (one) => one.offsetParent && !one.closest('h2')).map((one) => one.id)"""
 
@@ -28,6 +30,8 @@ class Camera:
     def __init__(self, node):
         self._pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
         self._objects = node.create_publisher(ObjectStates, 'objects', STREAM)
+        self._outlines = node.create_publisher(ImageMarker, 'objects/outlines', STREAM)
+        self.turned = False
         self._image = np.full((HIGH, WIDE, 3), 90, np.uint8)
         self._stamp, self.selected = 10**9, None
         node.create_timer(0.1, self._send)
@@ -40,6 +44,9 @@ class Camera:
             message = self._encode()
             message.states = ['seen', 'hidden'][:len(message.objects)]
             message.confidence = [0.9] * len(message.objects)
+            for one in message.objects if self.turned else ():
+                self._outlines.publish(ImageMarker(header=message.header, ns=one.name, points=[
+                    Point(x=one.u + du, y=one.v + dv) for du, dv in TURNED]))
             self._objects.publish(message)
 
     def _encode(self):
@@ -54,7 +61,7 @@ class Camera:
         self.selected, response.success = request, True
         response.objects = self._encode().objects
         response.outlines = [Polygon(points=[
-            Point32(x=u + du, y=v + dv) for du, dv in ((-9.0, -9.0), (9.0, -9.0), (0.0, 9.0))])
+            Point32(x=u + du, y=v + dv) for du, dv in OUTLINE])
             for u, v in zip(request.u, request.v)]
         return response
 
@@ -113,7 +120,7 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
             page.click('#follow')
             page.wait_for_selector('#error:not(:empty)')
             assert page.inner_text('#error') == (
-                'not followed: thumb is on nothing; click on an object')
+                'not taken: thumb is on nothing; click on an object')
             assert page.locator('#follow').bounding_box() == before, 'nothing moves'
             page.fill('#clicks li:last-child input', 'ring')
             page.click('#follow')
@@ -122,16 +129,51 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
             clicked = np.column_stack([camera.selected.u, camera.selected.v])
             assert np.abs(clicked - (CUP, RING)).max() < 1, 'pixels of the camera'
             page.wait_for_selector('#step-goal[aria-current=step]')
-            assert says(page, 'objects') == '2 followed' and not page.inner_text('#error')
+            assert says(page, 'objects') == '2 objects in sight' and not page.inner_text('#error')
             assert 'ring: hidden, 90 %' in page.inner_text('#clicks')
             assert not hidden_or_over(page, '#stage', '#said', '#views', '#photograph', '#cancel')
             page.click('#photograph')
-            page.wait_for_function('pictures.goal')
+            page.wait_for_function('pictures.goal && state.goal.pictured')
             page.wait_for_function('events.length && events.at(-1).picture')
             assert says(page, 'predict') == 'needs the predictor, which does not run'
             assert not {'predict', 'direct', 'subgoal-run'} & {*page.evaluate(LIVE)}
         page.wait_for_function("/silent/.test($('step-scene').textContent)")
         assert 'photograph' not in page.evaluate(LIVE)
+
+
+def turned(page, name):
+    """Return the outline of an object as the page draws it, relative to the object."""
+    return page.evaluate(f'outlines.{name}')
+
+
+def test_outlines_turn_with_objects_and_a_goal_that_is_moved_is_not_gone_on_to(explorer, browser):
+    with opened(browser, explorer.node.url) as page, Client('camera') as node:
+        camera = Camera(node)
+        page.wait_for_function('pictures.camera && state.tracker && state.camera.width')
+        page.mouse.click(*at(page, *CUP))
+        assert page.inner_text('#follow') == 'use this 1 object'
+        page.click('#follow')
+        page.wait_for_function('outlines.object_0 && state.camera.objects.length')
+        assert np.abs(np.subtract(turned(page, 'object_0'), OUTLINE)).max() < 0.11
+        camera.turned = True
+        page.wait_for_function('outlines.object_0[0][0] > 0')
+        assert np.abs(np.subtract(turned(page, 'object_0'), TURNED)).max() < 0.11
+        page.click('#photograph')
+        for go_on, place in ((False, RING), (True, CUP)):
+            page.wait_for_function("pictures.goal && state.movable === 'goal'")
+            page.evaluate("look('goal')")
+            if go_on:
+                explorer.node._calls.forget_end('via subgoal: stopped', spent=True)
+                page.wait_for_function("/^go on/.test($('direct').textContent)")
+            begin = page.evaluate('goalPlaces()[0]')
+            page.mouse.move(*at(page, begin['u'], begin['v']))
+            page.mouse.down()
+            page.mouse.move(*at(page, *place))
+            page.mouse.up()
+            page.wait_for_function(
+                f'state.goal.objects.some(({{u}}) => Math.abs(u - {place[0]}) < 2)')
+        page.wait_for_function("/^go directly/.test($('direct').textContent)")
+        assert says(page, 'go') == 'needs the planner, which does not run'
 
 
 def test_keys_and_a_screen_reader_reach_all_that_a_pointer_does(explorer, browser):

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from tap_ros.apps.explorer import events, words
 from tap_ros.apps.explorer.browser_commands import COMMANDS, REFUSED
+from tap_ros.apps.explorer.display import simulated
 from tap_ros.apps.explorer.events import Events
-from tap_ros.apps.explorer.words import NodeStates, plain
+from tap_ros.apps.explorer.words import NodeStates, plain, renamed
 
 OK, WARN, ERROR, STALE = (getattr(DiagnosticStatus, level)
                           for level in ('OK', 'WARN', 'ERROR', 'STALE'))
@@ -84,6 +85,17 @@ def test_whoever_says_too_much_of_itself_fills_no_memory():
 def test_a_refusal_is_told_in_words_and_keeps_its_remedy(said, meant):
     assert plain(said) == meant
     assert REFUSED.keys() == COMMANDS.keys()
+
+
+def test_the_simulator_calls_objects_otherwise_and_a_refusal_by_their_names_here():
+    truth = {'object_0': (10.0, 10.0), 'object_1': (50.0, 40.0), 'object_2': (90.0, 90.0)}
+    followed = {'object_1': (10.5, 9.0), 'object_0': (50.0, 41.0), 'far': (70.0, 10.0)}
+    their = simulated(followed, truth, 100)
+    assert their == {'object_1': 'object_0', 'object_0': 'object_1'}
+    assert simulated(truth, truth, 100) == {name: name for name in truth}
+    here = {each: name for name, each in their.items()} | {'object_2': 'another'}
+    assert renamed('object_0 and object_1 would overlap; object_2, object_10', here) == (
+        'object_1 and object_0 would overlap; another, object_10')
 
 
 def test_events_have_times_and_the_picture_of_soon_after_and_are_few(monkeypatch):

@@ -467,11 +467,15 @@ def test_the_explorer_selects_proposes_and_moves_goals_of_objects_by_their_own_n
         click({'left': second, 'right': first})  # not the names of the simulator
         chosen = told('selection', lambda selection: selection['followed'] and selection['count'])
         for one in chosen['objects']:
-            outline = np.array(one['outline'])
+            outline = np.array(one['outline']) - (one['u'], one['v'])
             assert (outline.min(axis=0) < -1).all() and (outline.max(axis=0) > 1).all()
         shown = told('state', lambda state: state['goal']['objects'] and state['movable'])
         assert [one['state'] for one in shown['camera']['objects']] == ['seen', 'seen']
-        goal = {one['name']: one for one in shown['goal']['objects']}['right']
+        goals = {one['name']: one for one in shown['goal']['objects']}
+        goal, count = goals['right'], shown['problem']['count']
+        ask('move', name='right', u=goals['left']['u'], v=goals['left']['v'])
+        said = told('state', lambda state: state['problem']['count'] > count)['problem']['text']
+        assert 'right' in said and 'left' in said and 'object_' not in said, said
         _, names, before = scene.at('truth/goal/objects', goal_ns)
         ask('move', name='right', u=goal['u'] + 8.0, v=goal['v'])
         moved = scene.topics['truth/goal/objects'].wait(
@@ -481,6 +485,8 @@ def test_the_explorer_selects_proposes_and_moves_goals_of_objects_by_their_own_n
         told('state', lambda state: any(
             one['name'] == 'right' and abs(one['u'] - goal['u'] - 8.0) < SIZE / 64
             for one in state['goal']['objects']))
+        scene.move(0.02, 0.02, 0.0)
+        told('state', lambda state: all('outline' in one for one in state['camera']['objects']))
         ask('reset', task='push2', seed=SEED + 1)
         told('state', lambda state: state['seed'] == SEED + 1
              and not (state['camera']['objects'] or state['goal']['objects']))

@@ -14,7 +14,8 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from tap_msgs.action import ReachGoal
 from tap_ros.apps.explorer.display import Display, GoalByHand, simulated
-from tap_ros.apps.explorer.words import plain
+from tap_ros.apps.explorer.words import plain, renamed
+from tap_ros.base.contract import step_budget
 from tap_ros.base.errors import TapError
 from tap_ros.base.text import escaped
 from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
@@ -26,7 +27,7 @@ from tap_ros.weights import PREDICTORS
 
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
-STEP_BUDGET = 80  # of a goal in the simulator; for a real arm the planner's own limit holds
+STEP_BUDGET = 80  # of a goal in the simulator; for a real arm the usual limit holds
 END_S = 6.0  # that a cancel may take when the node ends
 LARGEST = 1e6  # of a pixel
 UNDER_WAY = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
@@ -57,7 +58,7 @@ COMMANDS: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {  # do: {fi
     'photograph': {}}  # take the camera's newest picture as the goal
 REFUSED = {  # of each, when it could not be done
     'reset': 'no new scene', 'predict': 'no subgoal', 'reach': 'the arm stopped',
-    'cancel': 'not cancelled', 'select': 'not followed', 'propose': 'nothing found',
+    'cancel': 'not cancelled', 'select': 'not taken', 'propose': 'nothing found',
     'move': 'the goal was not moved', 'photograph': 'no goal picture'}
 
 
@@ -104,7 +105,7 @@ class ExplorerCalls:
         self._lock = threading.Lock()
         self._goal: Reaching | None = None
         self._asked = self._cancelled = self._ending = False  # asked: by a browser, for a goal
-        self._stage = ''
+        self._stage, self._most = '', 0  # most steps of the goal
         self.forget_end()
         self._under_way = False  # a goal, whoever sent it
         self._planner: Presence | None = None  # that said so
@@ -222,11 +223,18 @@ class ExplorerCalls:
 
     def _move(self, name: str, u: float, v: float) -> None:
         display = self._display
-        moved = simulated(
-            name, (u, v), display.places('goal_objects'), display.places('true_goals'),
-            display.size('goal')['width']) if self.offered('set_goal') else {}
-        if moved:
-            self._client.set_goal(moved)
+        goals = display.places('goal_objects')
+        truth = display.places('true_goals') or goals
+        their = simulated(goals, truth, display.size('goal')['width']) if (
+            self.offered('set_goal')) else {}
+        if name in their:
+            du, dv = (there - here for there, here in zip(truth[their[name]], goals[name]))
+            try:
+                self._client.set_goal({their[name]: (u + du, v + dv)})
+            except CallError as error:
+                raise CallError(renamed(str(error), dict.fromkeys(
+                    truth, 'an object that is not followed') | {
+                        each: here for here, each in their.items()})) from error
         else:
             self._by_hand.place(name, (u, v), {
                 kind: message for kind, (message, _) in display.newest.copy().items()})
@@ -255,8 +263,10 @@ class ExplorerCalls:
         cancelled = self._cancelled
         if cancelled:
             raise CallError(f'{words}: cancelled before it began')
+        self._most = STEP_BUDGET if self.offered('reset') else step_budget(
+            len(self._display.places('objects')))
         goal = self._client.reach(
-            mode=mode, step_budget=STEP_BUDGET if self.offered('reset') else 0,
+            mode=mode, step_budget=self._most,
             on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
         with self._lock:
             self._goal, cancelled = goal, self._cancelled
@@ -271,5 +281,6 @@ class ExplorerCalls:
         self._display.events.add(end)
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
-        self._stage = (f'step {feedback.step}, to the {escaped(feedback.stage, 60)}, plan in '
-                      f'{feedback.planning_ms:.0f} ms with {feedback.plan_samples} samples')
+        self._stage = (
+            f'step {feedback.step} of at most {self._most}, to the {escaped(feedback.stage, 60)}, '
+            f'plan in {feedback.planning_ms:.0f} ms with {feedback.plan_samples} samples')

@@ -8,6 +8,7 @@ import json
 import math
 import threading
 import time
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.ros.calls import CallError
 from tap_ros.ros.topics import encode_objects, LATCHED
+from visualization_msgs.msg import ImageMarker
 
 SILENT_S = 2.0  # after which the page says that a topic is silent
 NEAR = 0.06  # of the picture's width: so near are two pixels of one object
@@ -42,6 +44,7 @@ class Display:
     :param node: whose log names messages that cannot be used.
     :ivar lock: of all that changes; newest: {kind: newest message, when it was received}.
     :ivar sizes: {kind: (width, height)} of pictures before they are made smaller.
+    :ivar outlines: the newest of each object that is followed, by its name.
     :ivar selection: what select_objects answered last, as JSON for the page.
     :ivar events: what happened.
     """
@@ -51,6 +54,7 @@ class Display:
         self.lock = threading.RLock()
         self.newest: dict[str, tuple[Any, float]] = {}
         self.sizes: dict[str, tuple[int, int]] = {}
+        self.outlines: dict[str, ImageMarker] = {}
         self.selection, self._selections = NOTHING_SELECTED, 0
         self.events = Events(self.picture)
 
@@ -64,18 +68,13 @@ class Display:
             return None
 
     def select(self, response: SelectObjects.Response, followed: bool) -> None:
-        """
-        Show outlines of objects that are followed from now on, or that are proposed.
-
-        They are relative to the pixel of their object, with which the page moves them.
-        """
+        """Show outlines of objects that are followed from now on, or that are proposed."""
         self._selections += 1
         self.selection = json.dumps({
             'kind': 'selection', 'count': self._selections, 'followed': followed,
-            'objects': [{'name': escaped(one.name, 100), 'u': one.u, 'v': one.v, 'outline': [
-                [round(point.x - one.u, 1), round(point.y - one.v, 1)]
-                for point in outline.points]}
-                for one, outline in zip(response.objects, response.outlines)]})
+            'objects': [{'name': escaped(one.name, 100), 'u': one.u, 'v': one.v,
+                         'outline': points_of(outline)}
+                        for one, outline in zip(response.objects, response.outlines)]})
 
     def places(self, kind: str) -> dict[str, Place]:
         """Return the places of objects by name; empty where they cannot be used."""
@@ -104,14 +103,26 @@ def picture_of(message: Any, kind: str) -> np.ndarray:
     return overlay(one.image, one.object_maps)
 
 
-def listed(places: Mapping[str, Place], message: ObjectStates | None = None
-           ) -> list[dict[str, Any]]:
-    """Return places as the page takes them; with what their message says of how sure they are."""
+def listed(places: Mapping[str, Place], message: ObjectStates | None = None,
+           outlines: Mapping[str, ImageMarker] = MappingProxyType({})) -> list[dict[str, Any]]:
+    """
+    Return places as the page takes them.
+
+    :param message: that they are of; it may say how sure they are.
+    :param outlines: the newest ones by name; those of its picture are taken.
+    """
     known = {one.name: {'state': state, 'confidence': round(confidence, 2)}
              for one, state, confidence in zip(
                  message.objects, message.states, message.confidence)} if message else {}
-    return [{'name': name, 'u': round(u, 2), 'v': round(v, 2), **known.get(name, {})}
-            for name, (u, v) in places.items()]
+    shapes = {name: {'outline': points_of(one)} for name, one in outlines.items()
+              if message and one.header.stamp == message.header.stamp}
+    return [{'name': name, 'u': round(u, 2), 'v': round(v, 2), **known.get(name, {}),
+             **shapes.get(name, {})} for name, (u, v) in places.items()]
+
+
+def points_of(outline: Any) -> list[list[float]]:
+    """Return the points of a message, (u, v) in pixels of the camera."""
+    return [[round(point.x, 1), round(point.y, 1)] for point in outline.points]
 
 
 def silence(now: float, newest: tuple[Any, float] | None) -> str:
@@ -195,22 +206,20 @@ class GoalByHand:
         self._made[kind].publish(message)
 
 
-def simulated(name: str, pixel: Place, goals: Mapping[str, Place],
-              truth: Mapping[str, Place], width: int) -> dict[str, Place]:
+def simulated(goals: Mapping[str, Place], truth: Mapping[str, Place],
+              width: int) -> dict[str, str]:
     """
-    Return what the simulator calls an object, and where it is to put its goal; {} if nowhere.
+    Return what the simulator calls objects, by their names here; not what it has nowhere near.
 
-    :param pixel: in the goal picture.
     :param goals: of the objects; those that are followed have names of their own, and the pixels
         of their middles.
-    :param truth: what the simulator says where it is asked only for measuring, else empty.
+    :param truth: goals that the simulator tells for measuring, where objects are followed.
     :param width: of the goal picture.
     """
-    if name not in goals or not truth:
-        return {name: pixel} if name in goals else {}
-    nearest = min(truth, key=lambda each: math.dist(truth[each], goals[name]))
-    du, dv = np.subtract(truth[nearest], goals[name]).tolist()
-    return {nearest: (pixel[0] + du, pixel[1] + dv)} if math.hypot(du, dv) < NEAR * width else {}
+    nearest = {name: min(truth, key=lambda each: math.dist(truth[each], goal))
+               for name, goal in goals.items()}
+    return {name: their for name, their in nearest.items()
+            if math.dist(truth[their], goals[name]) < NEAR * width}
 
 
 def _by_name(message: ObjectStates | None) -> dict[str, tuple[float, float, str, float]]:

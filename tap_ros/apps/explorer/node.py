@@ -20,6 +20,7 @@ from tap_ros.base.plugins import names
 from tap_ros.base.text import escaped
 from tap_ros.images.drawing import picture_bytes
 from tap_ros.messages.images import is_empty
+from tap_ros.messages.objects import MAX_OBJECTS
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.ros.diagnostics import Diagnostics
 from tap_ros.ros.observations import reception_time
@@ -31,6 +32,7 @@ from tap_ros.ros.subscriptions import (
     steady_timer,
 )
 from tap_ros.ros.topics import camera_image, LATCHED, STREAM
+from visualization_msgs.msg import ImageMarker
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
 OBSERVER = 'observer/image_raw'
@@ -73,6 +75,8 @@ class ExplorerNode(Node):
             self._keep(ObjectStates, 'truth/goal/objects', 'true_goals', LATCHED, counted=False),
             AdaptiveSubscription(self, Episode, 'episode', self._on_episode, STREAM),
             AdaptiveSubscription(
+                self, ImageMarker, 'objects/outlines', self._on_outline, STREAM),
+            AdaptiveSubscription(
                 self, DiagnosticArray, '/diagnostics', self._on_diagnostics, STREAM)])
         steady_timer(self, PERIOD_S, self._show)
         self.get_logger().info(f'ready: open {self.url}')
@@ -106,6 +110,8 @@ class ExplorerNode(Node):
                     self._calls.forget_end()
                 if name in OF_A_SCENE and self._is_old(message):
                     return
+                if name == 'goal_objects' and before and _places(before) != _places(message):
+                    self._calls.forget_end()  # of a goal that somebody has moved since
                 newest[name] = message, reception_time(info)
                 self._changed.add(name)
         return AdaptiveSubscription(self, kind, topic, keep, qos)
@@ -131,6 +137,12 @@ class ExplorerNode(Node):
                 for kind in ('objects', 'goal_objects'):
                     if self._is_old(self._display.newest.get(kind, [ObjectStates()])[0]):
                         self._display.newest.pop(kind)
+
+    def _on_outline(self, message: ImageMarker) -> None:
+        """Keep the outline of an object; of more than there can be none is shown."""
+        if len(self._display.outlines) >= MAX_OBJECTS:
+            self._display.outlines.clear()
+        self._display.outlines[message.ns] = message
 
     def _is_old(self, message: Any) -> bool:
         """Return whether a message is of an old scene; not with stamp 0, as that of a file."""
@@ -171,7 +183,8 @@ class ExplorerNode(Node):
             'movable': '' if running else self._movable(
                 bool(objects), bool(goals), 'goal' in newest),
             'camera': {**shown.size('camera'),
-                       'objects': display.listed(objects, newest.get('objects', [None])[0]),
+                       'objects': display.listed(
+                           objects, newest.get('objects', [None])[0], shown.outlines.copy()),
                        'targets': display.listed({n: goals[n] for n in objects if n in goals}),
                        'note': display.silence(now, newest.get('camera'))},
             'goal': {**shown.size('goal'),
@@ -193,6 +206,11 @@ class ExplorerNode(Node):
         if not objects or (self._calls.offered('reset') and not self._calls.offered('select')):
             return ''
         return 'goal' if pictured else 'camera'
+
+
+def _places(message: ObjectStates) -> list[tuple[str, float, float]]:
+    """Return where a message says that objects are."""
+    return [(one.name, one.u, one.v) for one in message.objects]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What nodes say of themselves, and why they refuse, in words instead of topics."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 import re
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -25,6 +25,12 @@ def plain(text: str) -> str:
     text = re.sub(r'; call \S*select_objects', '; click on them', text)
     return re.sub(r'\bon (/[\w/]*\w(?:, /[\w/]*\w)*)', lambda found: 'from ' + ', '.join(
         map(word, found[1].split(', '))), text)
+
+
+def renamed(text: str, names: Mapping[str, str]) -> str:
+    """Return a text in which objects are called otherwise; names: {there: here}."""
+    any_of = '|'.join(map(re.escape, names))
+    return re.sub(rf'(?<!\w)(?:{any_of})(?!\w)', lambda found: names[found[0]], text)
 
 
 def word(topic: str) -> str:

@@ -59,7 +59,7 @@ function draw() {
   const last = state.lengths[episode] - 1, count = Object.keys(state.marks).length;
   $('now').classList.toggle('marked', draft.includes(frame));
   $('where').textContent = `${second(frame)} of ${second(last)}, frame ${frame} of ${last}`;
-  $('count').textContent = `${count} of ${Math.max(state.enough, count)} marked`;
+  $('count').textContent = count < state.enough ? `${count} of ${state.enough} marked` : `${count} marked: enough`;
   $('busy').textContent = state.busy ? 'finding labels …' : '';
   $('play').textContent = playing ? 'Stop' : 'Play';
   const listed = draft.map((t, k) => t === null ? `${nameOf(k)} not yet` : `${nameOf(k)} ${second(t)}`);

@@ -9,7 +9,6 @@ import threading
 import time
 from typing import Any
 
-from geometry_msgs.msg import Point32, Polygon
 import numpy as np
 from rclpy.node import Node
 from tap_msgs.msg import ObjectStates
@@ -23,6 +22,7 @@ from tap_ros.messages.objects import decode_objects, MAX_OBJECTS
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE
 from tap_ros.nodes.tracker.inputs import drawn_in, select, TrackerInputs
+from tap_ros.nodes.tracker.outlines import OutlinePublisher, polygons
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.ros.calls import answering, log_error
 from tap_ros.ros.observations import Moment
@@ -74,6 +74,7 @@ class TrackerNode(Node):
         self._sensors, self._goals = self._inputs.sensors, self._inputs.goals
         self._objects = self.create_publisher(ObjectStates, 'objects', STREAM)
         self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
+        self._outlines = OutlinePublisher(self)
         self.create_service(SelectObjects, 'select_objects', answering(self, self._on_select),
                             qos_profile=SERVICE_QOS)
         self._closed = False
@@ -112,9 +113,7 @@ class TrackerNode(Node):
                     request, moment, view, plane, camera)
             response.objects = self._encode(
                 found, tracked, plane, moment.messages['image'].header).objects
-        response.outlines = [Polygon(points=[
-            Point32(x=float(u), y=float(v)) for u, v in outline]) for outline in tracked.outlines]
-        response.success = True
+        response.outlines, response.success = polygons(tracked), True
         return response
 
     def _select(self, request: SelectObjects.Request, moment: Moment, view: View,
@@ -224,8 +223,9 @@ class TrackerNode(Node):
         begin = time.perf_counter()
         tracked = selection.tracker.update(view)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'track')
-        message = self._encode(
-            selection.names, tracked, selection.plane, moment.messages['image'].header)
+        header = moment.messages['image'].header
+        message = self._encode(selection.names, tracked, selection.plane, header)
+        self._outlines.send(selection.names, tracked, header)
         self._objects.publish(message)
         self._log_states(selection, tracked)
         self._selection = replace(self._selection, tracked=tracked, message=message)

@@ -29,12 +29,14 @@ function connect() {
   };
 }
 
+const objectCount = (count) => `${count} ${count === 1 ? 'object' : 'objects'}`;
 const connected = () => socket.readyState === WebSocket.OPEN;
 
 function take(message) {
   if (message.kind === 'state') {
     const before = state;
     state = message;
+    Object.assign(outlines, relative(state.camera.objects));
     if (before?.scene !== state.scene) {
       $('seed').value = state.seed ?? 7;
       step = '';
@@ -88,19 +90,19 @@ function progress() {
   const go_why = !state.plans ? `nothing plans how to grasp: for ${state.task} subgoals are predicted only`
     : camera_why || (!count && 'needs objects: step 2') || (missing.length && `needs the goal of ${missing.join(', ')}: step 3`)
     || (!state.planner && 'needs the planner, which does not run');
-  const clicked = clicks.length ? `${clicks.length} clicked; when all are, follow` : 'waits for objects: click on them';
+  const clicked = clicks.length ? `${objectCount(clicks.length)} so far` : 'waits for objects: click on them';
   const unsure = camera.objects.filter((one) => ['unsure', 'lost'].includes(one.state)).map(({name}) => name);
   return {
     scene: [!camera_why, camera_why || (!simulator ? `${camera.width}x${camera.height} pixels`
       : state.seed === null ? state.task : `${state.task}, seed ${state.seed}`)],
     objects: [count > 0 && !anew, selecting() ? clicked : !count ? 'waits for objects'
-      : unsure.length ? `not sure of ${unsure.join(', ')}` : tracker ? `${count} followed` : `${count} known`, camera_why],
+      : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} in sight`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
       ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
       : count && missing.length ? `drag ${missing.join(', ')} to its goal` : goal.pictured ? 'the picture is there' : 'placed by hand',
     camera_why],
-    predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : predict_why || 'ready', predict_why],
-    go: [run.reached, run.running ? run.stage : run.end || go_why || 'ready', go_why]};
+    predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : predict_why || 'can be predicted now', predict_why],
+    go: [run.reached, run.running ? run.stage : run.end || go_why || 'the arm can go now', go_why]};
 }
 
 function showState() {
@@ -115,24 +117,24 @@ function showState() {
     item.querySelector('span').textContent = done[one][1];
   }
   // What cannot work yet cannot be pressed.
-  const busy = !on ? 'there is no connection' : run.running ? 'a goal is in progress' : '';
+  const busy = !on ? 'there is no connection' : run.running ? 'the arm moves: wait for its end, or cancel' : '';
   for (const id of ['task', 'seed', 'start', 'another']) allow(id, busy);
   allow('propose', busy || done.objects[2] || (!goal.pictured && 'needs a goal picture'),
     'what differs between the picture of now and the goal');
-  allow('follow', busy || done.objects[2] || (!clicks.length && 'click on the objects first'));
+  allow('follow', busy || done.objects[2] || (!clicks.length && 'click on the objects first'), 'the camera follows them from now on');
   allow('again', busy);
   allow('photograph', busy || done.goal[2]);
   allow('predict', busy || done.predict[2]);
   allow('direct', busy || done.go[2], 'to the goal at once');
   allow('subgoal-run', busy || done.go[2] || done.predict[2], 'first to a predicted subgoal');
-  $('subgoal-run').textContent = `go ${run.spent ? 'on ' : ''}via subgoal`;
-  $('direct').textContent = `go ${run.spent ? 'on ' : ''}direct`;
+  $('subgoal-run').textContent = `go ${run.spent ? 'on ' : ''}via the subgoal`;
+  $('direct').textContent = `go ${run.spent ? 'on ' : ''}directly`;
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
   $('propose').hidden = $('follow').hidden = !selecting();
   $('again').hidden = !state.tracker || (selecting() && !anew);
-  $('again').textContent = anew ? 'keep those before' : 'click others';
-  $('follow').textContent = clicks.length > 1 ? `follow these ${clicks.length}` : 'follow';
+  $('again').textContent = anew ? 'keep the old objects' : 'choose other objects';
+  $('follow').textContent = clicks.length ? `use ${clicks.length > 1 ? 'these' : 'this'} ${objectCount(clicks.length)}` : 'use these objects';
   $('view-observer').parentElement.hidden = !state.observer;
   if (state.tasks.join() !== [...$('task').options].map((one) => one.value).join()) {
     fill($('task'), state.tasks, (task) => new Option(task, task));
@@ -173,7 +175,7 @@ function open(one, moves = state.run.end) {
 
 function hint() {
   if (view === 'camera' && selecting()) {
-    return clicks.length ? 'Click the middle of the next object, or press "follow".'
+    return clicks.length ? `Click the middle of the next object; if there is none, press "${$('follow').textContent}".`
       : state.simulator || state.goal.pictured ? 'Click the middle of each object that is to be moved.'
         : 'Photograph the objects where they are to be, put them back, then click the middle of each.';
   }

@@ -20,13 +20,13 @@ function takeSelection({count, followed, objects}) {
   const fresh = selections !== null && count !== selections;
   selections = count;
   if (followed) {
-    outlines = Object.fromEntries(objects.map(({name, outline}) => [name, outline]));
+    outlines = relative(objects);
     if (fresh) select(false);
   } else if (fresh && asked) {
     asked = false;
     const near = NEAR * state.camera.width;  // what was clicked already stays
     for (const one of objects) {
-      if (clicks.every(({u, v}) => Math.hypot(u - one.u, v - one.v) > near)) addClick(one);
+      if (clicks.every(({u, v}) => Math.hypot(u - one.u, v - one.v) > near)) addClick({...one, outline: relative([one])[one.name]});
     }
   }
   if (state) showState();
@@ -55,7 +55,7 @@ function listObjects() {
     Object.assign(button('✕', () => {
       clicks.splice(k, 1);
       showClicks();
-    }), {title: 'do not follow this one', ariaLabel: `not ${one.name}`})]
+    }), {title: 'leave this one out', ariaLabel: `not ${one.name}`})]
     : [mark(colourOf(one.name)), one.name + (one.state ? `: ${one.state}, ${Math.round(100 * one.confidence)} %` : '')]));
 }
 

@@ -21,7 +21,7 @@ let state = null;
 const pictures = {};  // kind -> ImageBitmap
 const numbers = {};  // kind -> how many have come
 let view = 'camera';  // kind of the large picture
-let outlines = {};  // name -> outline of an object that is followed, relative to its pixel
+let outlines = {};  // name -> newest outline of an object that is followed, relative to its pixel
 let clicks = [];  // {name, u, v, outline} of objects to follow
 let drag = null;  // {name, u, v} while an object is dragged
 let moved = null;  // the same after it, until the goal changes
@@ -109,9 +109,17 @@ function colourOf(name) {
 const mark = (colour) => made('i', {style: `background: ${colour}`});
 const radius = (context) => context.canvas.width / context.getTransform().a * 0.035;
 
-/* An outline moves with its object's pixel: it is not turned, and shows no angle. */
-function drawOutlined(context, {u, v, state: known}, colour, outline) {
+/* Outlines relative to the pixels of their objects, with which they move until newer ones come. */
+const relative = (objects) => Object.fromEntries(objects.filter(({outline}) => outline?.length).map(
+  ({name, u, v, outline}) => [name, outline.map(([x, y]) => [x - u, y - v])]));
+
+function drawOutlined(context, {name, u, v, state: known}, colour, outline) {
   const r = radius(context);
+  context.font = `600 ${r}px system-ui, sans-serif`;
+  context.strokeStyle = '#000a';
+  context.strokeText(name, u + r, v - r);
+  context.fillStyle = colour;
+  context.fillText(name, u + r, v - r);
   context.strokeStyle = colour;
   context.setLineDash(known && known !== 'seen' ? [r / 2, r / 2] : []);
   context.beginPath();
