@@ -175,8 +175,11 @@ def machine():
     info = Path('/proc/cpuinfo').read_text().splitlines()
     model, flags = (next((line.partition(':')[2].strip() for line in info
                           if line.startswith(word)), '?') for word in ('model name', 'flags'))
-    amx = 'amx' if 'amx_bf16' in flags.split() else ''
-    return ' '.join(filter(None, [model, amx, f'torch {torch.__version__.split("+")[0]}']))
+    # Processors of one name differ in these.
+    known = {'amx_bf16': 'AMX', 'avx512_bf16': 'AVX-512 with bfloat16', 'avx512f': 'AVX-512',
+             'avx2': 'AVX2'}
+    best = next((name for flag, name in known.items() if flag in flags.split()), '')
+    return ' '.join(filter(None, [model, best, f'torch {torch.__version__.split("+")[0]}']))
 
 
 def make():
