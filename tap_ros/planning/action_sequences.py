@@ -129,6 +129,11 @@ class SequenceShape:
         actions[..., :2] *= np.where(low, slow, 1)[..., None]
         return actions
 
+    def rise(self, height: float) -> np.ndarray:
+        """Return actions (HORIZON, 4) that lift the gripper on the spot from a height, m."""
+        still = np.array([0.0] * 2 * MOVES + [SEGMENTS, 0])
+        return self.actions(still[None], height)[0]
+
 
 def split(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return displacements (N, MOVES, 2), the lifted segments and the phases, ints (N,)."""

@@ -27,7 +27,7 @@ from tap_ros.planning.hierarchy import Itinerary, Target
 from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 
 MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
-MOST_UNSURE = 3  # pictures in a row in which an object is not known for sure; likewise
+MOST_UNSURE = 10  # pictures in a row in which an object is not known for sure; likewise
 MOST_LATE = 3  # plans in a row that took too long to be acted upon; likewise
 SENDING = 0.1  # share of max_age that is left for sending a command
 
@@ -141,7 +141,7 @@ class Reach:
         self._mpc, self._config, self._seed = mpc, config, seed
         self._tabulated: tuple[Target, Goal] | None = None
         self._first: Observation | None = None
-        self._unsure: dict[str, list[int]] = {}  # object -> stamps of pictures in a row
+        self._unsure: dict[str, set[int]] = {}  # object -> stamps of pictures in a row
         self._planned: Command | None = None
         self._answered: Command | None = None
         self._after_ns = -1  # pictures count that are stamped later than this
@@ -216,7 +216,7 @@ class Reach:
             return self._planned
         self._first = self._first or seen
         if self._state is None:
-            return SelectTargets(seen)
+            return Wait('an object is unsure') if UNSURE in seen.states else SelectTargets(seen)
         return self._plan(seen, self._state, (1 - SENDING) * self._config.max_age - age)
 
     def interrupted(self, seen: Observation | None) -> End | None:
@@ -238,14 +238,11 @@ class Reach:
         if lost:
             return f'{listing(lost)} lost; see where it is, and select the objects again'
         for name, state in zip(seen.names, seen.states):
-            stamps = self._unsure.setdefault(name, [])
-            if state != UNSURE:
-                stamps.clear()
-            elif seen.stamp_ns not in stamps:
-                stamps.append(seen.stamp_ns)
+            stamps = self._unsure.get(name, set()) | {seen.stamp_ns}
+            self._unsure[name] = stamps = stamps if state == UNSURE else set()
             if len(stamps) >= MOST_UNSURE:
-                return (f'{name} is unsure in {len(stamps)} pictures in a row; see where it is, '
-                        'and select the objects again')
+                return (f'{name} is unsure in {len(stamps)} pictures in a row, the arm lifted; see '
+                        'where it is, and select the objects again')
         return ''
 
     def set_targets(self, targets: Sequence[Target], now: float = 0.0) -> None:
@@ -312,10 +309,14 @@ class Reach:
         self._next = state
         self.pixels = pixels = seen.pixels
         self.distance = itinerary.targets[-1].distance(pixels)
-        if self.distance <= config.reached:
+        if self.distance <= config.reached and UNSURE not in seen.states:
             return End('reached', 'reached')
         if self.steps >= self._budget:
             return End('spent', f'stopped, as the step budget of {self._budget} is spent')
+        if UNSURE in seen.states:  # nothing is pushed by a place that is not believed
+            plan = self._mpc.aside(seen.gripper, self.distance, state.memory, config.limits)
+            self._next = replace(state, memory=plan.memory)
+            return Command(plan, len(state.switches), seen)
         # what to go to
         before = len(state.switches) - len(state.earlier)
         stage = itinerary.stage(self.steps - state.first_step, pixels, before)
@@ -329,7 +330,6 @@ class Reach:
         if known is None or known[0] is not target or target.free is not None:
             inside = np.clip(pixels, 0, np.array(seen.image.shape[1::-1]) - 1)
             known = self._tabulated = target, self._mpc.goal(**target.goal(inside))
-        # plan
         plan = self._mpc.plan(Scene(seen.image, seen.gripper, pixels), known[1], state.memory,
                               config.limits, seconds)
         self._next = replace(state, memory=plan.memory)

@@ -139,7 +139,6 @@ class Plan:
     planning_ms: float
     actions: np.ndarray  # (HORIZON, 4) the whole sequence
     elites: np.ndarray  # (E, HORIZON, 4) the best ones that were considered
-    places: np.ndarray  # (K, 2) m, of the table cells nearest to the goals
     cost: float  # what the search minimised: px, summed over objects and time
     num_samples: int  # that the search judged
     memory: Memory  # for the next plan
@@ -210,8 +209,7 @@ class VisualMPC:
         cells = self.rollouts.compute(table.pixels).flatten(0, 1)
         if maps is None:
             goals, distances_of = check_pixels(pixels, 'goal_pixels'), torch.cdist
-            outside = goals[~in_picture(goals, self.image_size)].tolist()
-            if outside:
+            if outside := goals[~in_picture(goals, self.image_size)].tolist():
                 raise PlanningError(f'goal_pixels: {outside} outside the {width}x{height} picture')
         else:
             goals, distances_of = np.ascontiguousarray(maps, np.float32), distances_to_places
@@ -265,12 +263,18 @@ class VisualMPC:
         actions, *elites = shape.actions(parameters, gripper[2])
         _, (end,) = self.rollouts.judge(
             start, goal.distances, actions[None], gripper[None], HORIZON)
-        milliseconds = 1000 * (time.perf_counter() - begin)
         left, *kept = map(shift, parameters)
-        return Plan(actions[0], float(end), milliseconds, actions,
-                    np.array(elites), goal.places, found.cost, num_samples,
+        return Plan(actions[0], float(end), 1000 * (time.perf_counter() - begin), actions,
+                    np.array(elites), found.cost, num_samples,
                     Memory(memory.seed, memory.count + 1, left, np.array(kept),
                            (float(gripper[2]), float(gripper[2] + actions[0, 2])), blocked))
+
+    @staticmethod
+    def aside(gripper: np.ndarray, distance: float, memory: Memory, limits: Limits) -> Plan:
+        """Go straight up, by no object's place; distance: px, the Plan's expected_distance."""
+        actions = SequenceShape(limits).rise(gripper[2])
+        return Plan(actions[0], distance, 0.0, actions, actions[None], math.nan, 0,
+                    Memory(memory.seed, memory.count + 1, blocked=memory.blocked))
 
     def _search(self, shape: SequenceShape, start: 'Start', gripper: np.ndarray,
                 here: np.ndarray, goal: Goal, memory: Memory) -> tuple[Solution, int]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tap_ros.base.contract import LIFTED
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.protocols import SearchConfig
@@ -178,9 +179,9 @@ def test_another_scene_ends_the_goal_even_if_nothing_else_is_new(mpc, changes, w
 
 
 @pytest.mark.parametrize('states, steps, word', [
-    (['hidden'] * 6, 6, ''), (['unsure', 'unsure', 'seen'] * 2, 6, ''),
-    (['seen', 'unsure', 'unsure', 'unsure'], 3, 'b is unsure'), (['seen', 'lost'], 1, 'b lost')])
-def test_hidden_objects_stay_where_they_were_and_those_in_doubt_end_the_goal(
+    (['hidden'] * 6, 6, ''), (['unsure', 'unsure', 'seen'] * 3, 9, ''),
+    (['seen', *['unsure'] * 10], 10, 'b is unsure'), (['seen', 'lost'], 1, 'b lost')])
+def test_hidden_objects_stay_where_they_were_and_those_in_doubt_move_nothing_and_end_the_goal(
         mpc, states, steps, word):
     reach, usual = begun(mpc), begun(mpc)
     for t, state in enumerate(states):
@@ -189,9 +190,23 @@ def test_hidden_objects_stay_where_they_were_and_those_in_doubt_end_the_goal(
         if isinstance(answer, End):
             break
         reach.sent()
-        np.testing.assert_array_equal(answer.plan.action, act(usual, t))
+        x, y, up, opening = answer.plan.action
+        if state == 'unsure':  # straight up, as high as it travels
+            assert (x, y, opening) == (0, 0, 0) and up == pytest.approx(LIFTED - 0.1)
+            usual = None
+        elif usual is not None:
+            np.testing.assert_array_equal(answer.plan.action, act(usual, t))
     assert reach.steps == steps and isinstance(answer, End) == bool(word)
     assert not word or (answer.outcome, word in answer.message) == ('aborted', True)
+
+
+def test_what_is_unsure_is_not_there_and_begins_no_goal(mpc):
+    reach = begun(mpc)
+    there = GOAL.pixels
+    assert isinstance(reach.step(look(0, there, states=('seen', 'unsure'))), Command)
+    reach.sent()
+    assert reach.step(look(1, there)).outcome == 'reached'
+    assert isinstance(Reach(mpc, ReachConfig(10)).step(look(0, states=('unsure', 'seen'))), Wait)
 
 
 def test_each_command_is_planned_from_what_the_one_before_left(mpc):
