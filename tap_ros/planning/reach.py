@@ -241,8 +241,8 @@ class Reach:
             stamps = self._unsure.get(name, set()) | {seen.stamp_ns}
             self._unsure[name] = stamps = stamps if state == UNSURE else set()
             if len(stamps) >= MOST_UNSURE:
-                return (f'{name} is unsure in {len(stamps)} pictures in a row, the arm lifted; see '
-                        'where it is, and select the objects again')
+                return (f'{name} is unsure in {len(stamps)} pictures in a row, the arm lifted; '
+                        'see where it is, and select the objects again')
         return ''
 
     def set_targets(self, targets: Sequence[Target], now: float = 0.0) -> None:

@@ -134,9 +134,11 @@ class RigidTracker:
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
         picture = picture.by(one.face.metric)
-        if one.searched is not None and self._still(one, one.searched, picture):
+        one.waits -= 1
+        if one.state == SEEN and one.searched is not None and self._still(
+                one, one.searched, picture):
             return
-        one.searched, one.waits = None, one.waits - 1
+        one.searched = None
         if one.age and hand is not None:
             one.place = one.place + _pushed(one, hand)
         matcher = Matcher(picture, self._covered(one, picture))
@@ -147,7 +149,7 @@ class RigidTracker:
             one.state = (SEEN if pose.sure else HIDDEN if pose.seen < 0.5 else UNSURE)
             one.searched = picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
-                    one.part or pose.cost > NEW_COST
+                    one.part or not pose.alone or pose.cost > NEW_COST
                     or _turned(one, one.nearest()[0]) > NEW_ANGLE):
                 self._cut_anew(one, picture)
             return
@@ -217,10 +219,11 @@ class RigidTracker:
 
         That of an object of which a part was seen so far is of all of it, and corrects its place.
         """
-        one.waits, outline = WAITS, self._outline(one)
+        outline = self._outline(one)
         before = cv2.fillPoly(np.zeros(picture.size, np.uint8), [np.rint(outline).astype(int)], 1)
         if share(before, picture.hidden):
             return
+        one.waits = WAITS
         at, *others = self._plane.middle_pixels([one.place, *(
             other.place for other in self._objects if other is not one)])
         radius = 1.4 * float(np.linalg.norm(outline - at, axis=1).max()) + 4
