@@ -134,11 +134,9 @@ class RigidTracker:
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
         picture = picture.by(one.face.metric)
-        one.waits -= 1
-        if one.state == SEEN and one.searched is not None and self._still(
-                one, one.searched, picture):
+        if one.searched is not None and self._still(one, one.searched, picture):
             return
-        one.searched = None
+        one.searched, one.waits = None, one.waits - 1
         if one.age and hand is not None:
             one.place = one.place + _pushed(one, hand)
         matcher = Matcher(picture, self._covered(one, picture))
@@ -149,7 +147,7 @@ class RigidTracker:
             one.state = (SEEN if pose.sure else HIDDEN if pose.seen < 0.5 else UNSURE)
             one.searched = picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
-                    one.part or not pose.alone or pose.cost > NEW_COST
+                    one.part or pose.cost > NEW_COST
                     or _turned(one, one.nearest()[0]) > NEW_ANGLE):
                 self._cut_anew(one, picture)
             return
