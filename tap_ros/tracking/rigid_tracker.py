@@ -91,7 +91,7 @@ class RigidTracker:
         clicks = plane.shrink(np.reshape(pixels, (-1, 2)))
         names = [f'click {tuple(round(float(x), 1) for x in pixel)}'
                  for pixel in plane.enlarge(clicks)]
-        cuts = apart([clicked(
+        cuts = apart(picture, clicks, [clicked(
             picture, click, np.delete(clicks, k, 0), names[k],
             plane.shrink(drawn[k]) if len(drawn) and len(drawn[k]) else None)
             for k, click in enumerate(clicks)])

@@ -4,6 +4,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -193,14 +194,23 @@ def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
     return cut
 
 
-def apart(cuts: Sequence[Cut]) -> list[Cut]:
-    """Return cuts without what is in a smaller one, too: objects touch there."""
+def apart(picture: Picture, clicks: np.ndarray, cuts: Sequence[Cut]) -> list[Cut]:
+    """Return the cuts (K,) at clicks (K, 2) without what looks like another one: they touch."""
     found = list(cuts)
-    for k, cut in enumerate(cuts):
-        smaller = [one.mask for one in cuts if one.mask.sum() < cut.mask.sum()]
-        shared = np.logical_or.reduce(smaller) & cut.mask if smaller else np.False_
-        if shared.sum() > SHARED * cut.mask.sum() and (cut.mask & ~shared).sum() > LEAST_AREA:
-            found[k] = replace(cut, mask=cut.mask & ~shared, touched=True)
+    for i, j in combinations(range(len(found)), 2):
+        pair = [found[k].mask for k in (i, j)]
+        shared = pair[0] & pair[1]
+        if shared.sum() <= SHARED * min(mask.sum() for mask in pair):
+            continue
+        under = [_cut(picture, clicks[k], np.delete(clicks, k, 0), RADII[0], alone=True).mask
+                 for k in (i, j)]
+        own = [mask & ~shared | alone & ~other for mask, alone, other in zip(
+            pair, under, under[::-1])]
+        if all(mask.any() for mask in own):
+            nearer = np.subtract(*(Palette(picture.lab[mask]).distance(picture.index)
+                                   for mask in own)) < 0
+            for k, mask, mine in zip((i, j), pair, (nearer, ~nearer)):
+                found[k] = replace(found[k], mask=mask & (mine | ~shared))
     return found
 
 

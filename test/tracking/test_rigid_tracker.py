@@ -189,6 +189,16 @@ def test_objects_are_found_in_a_goal_picture_or_refused(tracker):
     assert np.abs(tracker.update(draw(STARTS)).pixels - STARTS).max() < 1.5
 
 
+@pytest.mark.parametrize('beside, turned', [((80, 116), 0), ((102, 100), np.pi / 2),
+                                            ((102, 108), np.pi / 2)])
+def test_objects_that_touch_when_they_are_clicked_are_told_apart(beside, turned):
+    places = np.array([(80.0, 100.0), beside])
+    for off in np.random.default_rng(0).uniform(-3, 3, (4, 2, 2)):
+        found = load_plugin('tap_ros.trackers', 'rigid')(None).select(
+            draw(places, (0, turned)), places + off)
+        assert np.linalg.norm(found.pixels - places, axis=1).max() < 2, off
+
+
 def test_what_moved_from_one_picture_to_another_is_proposed():
     found = propose(draw(STARTS, robot=(0, 0, 40, 60)), draw((STARTS[0], (120.0, 220.0))))
     assert len(found) == 1 and np.abs(found - STARTS[1:]).max() < 2
