@@ -156,7 +156,7 @@ class Matcher:
         # other sides show as it turns: any of its colours fits
         own = self._like(template, index)[0] > 1 - NEAR / FAR
         beside = self._like(template, self._look(template.ring, place[None], turned))[0]
-        # a camera whose pose is known sees its sides beside it as it turns
+        # where the camera is known only planks of its colour were beside it, and no other object
         alone = self.picture.plane.calibrated or not beside.size or (
             (beside > 1 - NEAR / FAR).mean() <= template.beside + MERGED)
         return float((same | own).sum() / known), bool(alone)

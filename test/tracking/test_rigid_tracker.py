@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.looks import LOOKS
+from sim_bridge.world.table import lifted
 from tap_ros.base.contract import HIDDEN, LOST, SEEN, UNSURE
 from tap_ros.base.errors import TrackingError
 from tap_ros.base.plugins import load_plugin
@@ -258,6 +259,25 @@ def test_what_a_click_selects_has_an_object_under_it(look):
     finally:
         simulator.close()
     assert selected > 4
+
+
+def test_what_comes_to_a_plank_of_its_own_colour_is_not_unsure():
+    simulator = Simulator('order2', 256, look='hand')
+    try:
+        seen, scene = simulator.reset(1_000_008), simulator.scene
+        tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
+            simulator.camera_matrix, seen.image.shape[:2], simulator.camera_pose))
+        tracker.select(View(seen.image, seen.robot_mask), seen.object_pixels)
+        way = np.array([[1.0], [0.0]]) * (scene.goal_poses - scene.start_poses)
+        for share in np.linspace(0, 1, 9)[1:]:
+            simulator.load(scene.shapes, lifted(scene.start_poses + share * way),
+                           scene.gripper_start, 0)
+            seen = simulator.observe()
+            found = tracker.update(View(seen.image, seen.robot_mask))
+            assert found.states == (SEEN, SEEN)
+            assert np.abs(found.pixels - seen.object_pixels).max() < 5
+    finally:
+        simulator.close()
 
 
 @pytest.mark.parametrize('place, along', [
