@@ -8,6 +8,7 @@ nodes, planning/reach.py, in fresh scenes. What counts is the environment's own 
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 import json
 import os
 from pathlib import Path
@@ -256,6 +257,7 @@ def write_results(runs, out, args):
         values = {'table': summarise(rows), 'marked': MARKED, 'episodes': args.episodes,
                   'steps': args.steps, 'predictor_steps': args.predictor_steps,
                   'budget': BUDGETS['push-wall-v3'],
+                  'dropped': {method: dropped(rows, method) for method in LEARNED},
                   'more': ahead([row for row in rows if row['task'] in WAYS])}
         template = f'worlds/templates/{page}.md.j2'
         known = Path(__file__).parents[1].joinpath(template).exists()
@@ -275,6 +277,19 @@ def ahead(rows):
             found[other] = '{:+.0f} points ({:+.0f} to {:+.0f})'.format(
                 *mean_interval((both['subgoal'] - both[other]).tolist()))
     return found
+
+
+def dropped(rows, method):
+    """
+    Say in how many runs of a method a subgoal is passed before any command goes to it.
+
+    It is reached already: where the objects are, or undecided, see hierarchy.Target.
+    """
+    there = [[row['ends'] for row in rows if row['method'] == method and said == any(
+        before == now for before, now in pairwise([0, *row['switches']]))]
+        for said in (True, False)]
+    return '{2} of {4} ({0} succeed, of the others {1} of {3})'.format(
+        *map(sum, there), *map(len, there), sum(map(len, there)))
 
 
 def summarise(rows):

@@ -74,6 +74,13 @@ def test_points_ahead_are_told_of_scenes_that_both_ran():
     assert loop.ahead(rows[:2]) == loop.ahead([]) == {}
 
 
+def test_runs_in_which_no_command_goes_to_a_subgoal_are_told_apart():
+    rows = [{'method': 'subgoal', 'ends': ends, 'switches': switches} for ends, switches in (
+        (True, [0, 9]), (False, [8, 8]), (False, [8, 9]), (True, [18, 36]), (True, []))]
+    assert loop.dropped([*rows, {**rows[1], 'method': 'fixed time'}, {'method': 'random'}],
+                        'subgoal') == '2 of 5 (1 succeed, of the others 2 of 3)'
+
+
 def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
         tmp_path, monkeypatch):
     ran = []
@@ -82,7 +89,8 @@ def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
         ran.append((task, method, seed))
         return seed % 2 and {
             'task': task, 'method': method, 'seed': seed, 'ends': method != 'random',
-            'ever': True, 'steps': 7, 'goal_cm': 1.0, 'start_cm': 20.0, 'final_cm': 2.5} or None
+            'ever': True, 'steps': 7, 'goal_cm': 1.0, 'start_cm': 20.0, 'final_cm': 2.5,
+            'switches': []} or None
 
     monkeypatch.setattr(loop, 'run_scene', run_scene)
     monkeypatch.setattr(loop, 'make_weights', lambda args, task, seed: {
