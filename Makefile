@@ -34,7 +34,7 @@ help:
 	@echo 'make worlds  demonstrations of other simulators, and who finds their bottlenecks; goes on'
 	@echo 'make faults  inject every fault into real nodes and disks, in docs/results; takes long;'
 	@echo '             ARGS="-k silent": only those; ARGS="--share 0.1": a tenth of the trials'
-	@echo 'make bench   measure the speed of each part, unless this code has; ARGS=...'
+	@echo 'make bench   measure the speed of what this version has not measured; ARGS=...'
 	@echo 'make lint    check the style of the code and its types'
 	@echo 'make build   only the set-up: .venv, install/; then, to work in it:'
 	@echo '             . scripts/environment.bash'

@@ -13,13 +13,14 @@ step() {
   shift
   printf '[%s] %s ... ' "$who" "$what"
   tick "$what" </dev/null &
-  trap "kill $! 2>/dev/null || true" EXIT
+  local ticker=$!
+  trap "kill $ticker 2>/dev/null || true" EXIT
   if ! "$@" >>"$log" 2>&1 </dev/null; then
     printf 'failed. The end of %s:\n\n' "$log"
     tail -n 30 "$log"
     exit 1
   fi
-  kill $! 2>/dev/null || true
+  kill $ticker 2>/dev/null || true
   trap - EXIT
   [ ! -t 1 ] || printf '\r[%s] %s ... ' "$who" "$what"
   printf '%d s\n' $((SECONDS - begin))

@@ -252,12 +252,13 @@ def compare(rows):
     two, three = ({row['task']: row for row in rows
                    if row['method'] == method and row.get('seeds', 0) > 1}
                   for method in WITH_MARKS)
-    found, alone = {'tasks': len(three)}, []
+    tasks = [task for task in three if task in two]
+    found, alone = {'tasks': len(tasks)}, []
     for name in ('hit', 'near'):
-        gains = [_less(three[task][name], two[task][name]) for task in three]
+        gains = [_less(three[task][name], two[task][name]) for task in tasks]
         found[name] = _in_points(mean_interval([gain.value for gain in gains]))
         alone += [f'{task.rpartition("/")[2]} {_in_points(gain)}'
-                  for task, gain in zip(three, gains) if gain.low > 0 or gain.high < 0]
+                  for task, gain in zip(tasks, gains) if gain.low > 0 or gain.high < 0]
     return found | {'alone': alone}
 
 

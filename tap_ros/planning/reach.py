@@ -153,7 +153,7 @@ class Reach:
         self._late = 0  # plans in a row
         self._sent_at = now  # of the last command, or when there was reason to wait
         self.steps, self.distance = 0, float('nan')
-        self.pixels: np.ndarray | None = None
+        self.pixels = np.empty((0, 2), np.float32)
 
     @property
     def targets(self) -> list[Target]:

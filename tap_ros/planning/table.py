@@ -14,6 +14,7 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.base.contract import GRIPPER_JOINTS, ROBOT_MASK_HAND
 from tap_ros.base.errors import RecordingError
 import torch
@@ -48,6 +49,12 @@ class Table:
     def places(self, pixels: torch.Tensor) -> torch.Tensor:
         """Return where on the table, in metres, pixels (..., N, 2) (u, v) are."""
         return project(torch.linalg.inv(self.homography), pixels)
+
+    def apart(self, pixels: ArrayLike, others: ArrayLike) -> float:
+        """Return the mean distance on the table, in metres, of pixels (N, 2) from others."""
+        here, there = (self.places(torch.as_tensor(given, device=self.device))
+                       for given in (pixels, others))
+        return float((here - there).norm(dim=-1).mean())
 
     def seed_maps(self, pixels: torch.Tensor) -> torch.Tensor:
         """

@@ -57,7 +57,8 @@ def _pixels(H: int, W: int, dtype: torch.dtype,
     """Return (u, v) of each pixel, (2, H, W), and the scale of both for a grid, (2, 1, 1)."""
     v, u = (torch.arange(side, device=device, dtype=dtype) for side in (H, W))
     return (torch.stack([u.expand(H, W), v[:, None].expand(H, W)]),
-            torch.tensor([2 / (W - 1), 2 / (H - 1)], device=device, dtype=dtype)[:, None, None])
+            torch.tensor([2 / max(side - 1, 1) for side in (W, H)], device=device,
+                         dtype=dtype)[:, None, None])
 
 
 def combine(warped: torch.Tensor, masks: torch.Tensor,

@@ -94,8 +94,7 @@ class Client:
                 self._context.try_shutdown()
                 raise ConfigError(f'namespace {escaped(namespace, 60)}: is no name of a '
                                   'namespace, such as /left') from error
-            self._spinner = Spinner(node)
-            self._spinner.__enter__()
+            self._spinner = Spinner(node).__enter__()
         self.node = node
         self._group = ReentrantCallbackGroup()
         self.answers = self._group if self._context is None else self._spinner.answers

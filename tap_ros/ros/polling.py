@@ -26,7 +26,7 @@ from tap_ros.base.text import escaped
 from tap_ros.ros.topics import SERVICE_QOS
 
 WAIT_NS = 5 * 10**7  # after which a thread looks whether its node ends, or has more to wait for
-MAX_TAKEN = 100  # requests before some are answered
+TAKING_S = 0.02  # after which those that were taken are answered
 
 
 class PollOnlyGroup(CallbackGroup):
@@ -136,15 +136,21 @@ class DeferredService:
         while not self._ended.is_set() and context.ok():
             try:
                 if more or wait_for_some(context, [self._service]):
-                    more = False  # should something fail
-                    for _ in range(MAX_TAKEN):
-                        if not self._take_one():
-                            break
-                    more = self._work()
+                    more = False  # should the work fail
+                    try:
+                        self._take_some()
+                    finally:  # what was taken is answered, though another could not be
+                        more = self._work()
             except Exception as error:
                 if context.ok():
                     self._log(error)
                     self._ended.wait(1)  # whatever it is, it may last
+
+    def _take_some(self) -> None:
+        """Take what has come; what takes long to come waits for the next time."""
+        deadline = time.monotonic() + TAKING_S
+        while self._take_one() and time.monotonic() < deadline:
+            pass
 
     def _take_one(self) -> bool:
         """Take a request if one waits; return whether it did."""

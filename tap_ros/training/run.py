@@ -45,6 +45,8 @@ Item = TypeVar('Item')  # what a step takes
 Config = TypeVar('Config', bound=RunConfig)
 Show = Callable[[np.ndarray], np.ndarray]  # from indices of episodes to a picture (H, W, 3)
 
+LARGE = 128  # px a side, above which pictures are trained on for long
+
 
 class Run(Generic[Config]):
     """
@@ -114,6 +116,9 @@ class Run(Generic[Config]):
                                  'that is long enough by itself; name whole bags, not files of '
                                  'a split one, or demonstrations: BAG:7')
         print(describe_split(self.held_out, self.training, marked), file=sys.stderr)
+        if (side := max(self.store.image_size)) > LARGE:
+            print(f'pictures of {side} px are trained on as they are; --size 64, as the shipped '
+                  'weights have it, is faster', file=sys.stderr)
         warn_if_few(self.held_out)
         digests = digests_of(self.store)
         self._held_out_digests = sorted({digests[i] for i in self.held_out})

@@ -26,6 +26,33 @@ class Deferring(Node):
         self.service.close()
 
 
+def test_what_was_taken_is_worked_on_though_another_request_cannot_be(capfd):
+    calls = []
+
+    class Failing(Deferring):
+        def __init__(self, **options):
+            super().__init__(Event(), **options)
+            self.service._work = lambda: calls.append('work')
+            self.service._take_one = self.take
+
+        def take(self):
+            calls.append('take')
+            if calls == ['take', 'take']:
+                raise RuntimeError('cannot be taken')
+            return len(calls) == 1
+
+    server = LocalNode(Failing)
+    with tap_ros.Client() as client:
+        asked = client.node.create_client(
+            SetBool, 'deferred', qos_profile=SERVICE_QOS, callback_group=client.answers)
+        assert asked.wait_for_service(30)
+        asked.call_async(SetBool.Request())
+        server.node.service.start()
+        assert until(lambda: len(calls) > 2, 30) and calls[:3] == ['take', 'take', 'work']
+    assert server.end() == 0
+    assert 'cannot be taken' in capfd.readouterr().err
+
+
 def test_requests_and_answers_are_taken_while_executors_are_busy():
     free = Event()
     server = LocalNode(lambda **options: Deferring(free, **options))

@@ -112,3 +112,12 @@ def test_work_that_answers_too_few_leaves_nobody_without_an_answer(made):
     rig.go.set()
     rig.put(1)
     assert '0 answers to 1 requests' in str(rig.wait(1)[1])
+
+
+def test_what_goes_together_is_answered_at_once_and_then_the_rest():
+    found = []
+    queue = RequestQueue(lambda batch: batch, lambda one: 1, 100, 8, 100)
+    for one in range(9):
+        queue.put(one, found.append)
+    assert queue.answer_batch() and found == list(range(8))
+    assert not queue.answer_batch() and found == list(range(9))

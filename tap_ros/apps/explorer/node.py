@@ -5,6 +5,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 import json
+import math
 import time
 from typing import Any
 
@@ -36,6 +37,7 @@ from visualization_msgs.msg import ImageMarker
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
 OBSERVER = 'observer/image_raw'
+MOST_POINTS = 1000  # of an outline
 OF_A_SCENE = ('objects', 'goal_objects', 'subgoal', 'plan')
 PICTURES = ('camera', 'goal', 'subgoal', 'plan', 'observer')
 
@@ -139,10 +141,14 @@ class ExplorerNode(Node):
                         self._display.newest.pop(kind)
 
     def _on_outline(self, message: ImageMarker) -> None:
-        """Keep the outline of an object; of more than there can be none is shown."""
-        if len(self._display.outlines) >= MAX_OBJECTS:
-            self._display.outlines.clear()
-        self._display.outlines[message.ns] = message
+        """Keep the outline of an object; one that cannot be drawn is passed over."""
+        outlines = self._display.outlines
+        if len(message.points) > MOST_POINTS or not all(
+                math.isfinite(point.x + point.y) for point in message.points):
+            return
+        if message.ns not in outlines and len(outlines) >= MAX_OBJECTS:
+            outlines.clear()
+        outlines[message.ns] = message
 
     def _is_old(self, message: Any) -> bool:
         """Return whether a message is of an old scene; not with stamp 0, as that of a file."""

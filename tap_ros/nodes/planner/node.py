@@ -41,7 +41,6 @@ from tap_ros.ros.robot_view import warn_if_unlike
 from tap_ros.ros.subscriptions import publishers_of, steady_timer
 from tap_ros.ros.topics import camera_topics, encode_image, goal_topics, STREAM, to_stamp
 from tap_ros.weights import find_forward_model
-import torch
 
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'
@@ -285,7 +284,9 @@ class VisualMpcNode(LifecycleBase):
                     raise PlanningError(answer.message)
                 self._distance.publish(Float64(data=reach.distance))
                 result.success = answer.outcome == 'reached'
-                result.message = f'{answer.message}: {self._how_far(reach)}'
+                far = self._mpc.model.table.apart(reach.pixels, reach.targets[-1].pixels)
+                result.message = (f'{answer.message}: objects on average {100 * far:.1f} cm from '
+                                  'their goals')
                 return
             if isinstance(answer, SelectTargets):
                 targets = self._goal.targets(
@@ -301,14 +302,6 @@ class VisualMpcNode(LifecycleBase):
                 self._publish_progress(handle, reach, answer)
             else:
                 self._sensors.wait_for_change(0.1, count)
-
-    def _how_far(self, reach: Reach) -> str:
-        """Say how far objects are from their goals, on the table as the model sees it."""
-        table = self._mpc.model.table
-        here, there = (table.places(torch.as_tensor(pixels, device=table.device)) for pixels in (
-            reach.pixels, reach.targets[-1].pixels))
-        far = float((here - there).norm(dim=-1).mean())
-        return f'objects on average {100 * far:.1f} cm from their goals'
 
     def _send(self, handle: ServerGoalHandle, accepted: float, reach: Reach,
               command: Command) -> bool:

@@ -54,7 +54,8 @@ class PredictorNode(LifecycleBase):
 
     Without autostart it offers the service at once, and refuses requests until it is active. One
     thread takes and checks the requests that have come, predicts what goes together, and sends the
-    answers: two would wait for each other, and for Python's lock after every operator.
+    answers: two would wait for each other, and for Python's lock after every operator. While it
+    predicts, nobody is answered.
     """
 
     def __init__(self, **options: Any) -> None:

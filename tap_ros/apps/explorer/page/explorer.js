@@ -96,7 +96,7 @@ function progress() {
     scene: [!camera_why, camera_why || (!simulator ? `${camera.width}x${camera.height} pixels`
       : state.seed === null ? state.task : `${state.task}, seed ${state.seed}`)],
     objects: [count > 0 && !anew, selecting() ? clicked : !count ? 'waits for objects'
-      : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} in sight`, camera_why],
+      : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
       ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
       : count && missing.length ? `drag ${missing.join(', ')} to its goal` : goal.pictured ? 'the picture is there' : 'placed by hand',
@@ -121,7 +121,7 @@ function showState() {
   for (const id of ['task', 'seed', 'start', 'another']) allow(id, busy);
   allow('propose', busy || done.objects[2] || (!goal.pictured && 'needs a goal picture'),
     'what differs between the picture of now and the goal');
-  allow('follow', busy || done.objects[2] || (!clicks.length && 'click on the objects first'), 'the camera follows them from now on');
+  allow('follow', busy || done.objects[2] || (!clicks.length && 'click on the objects first'), 'they are followed from now on');
   allow('again', busy);
   allow('photograph', busy || done.goal[2]);
   allow('predict', busy || done.predict[2]);
