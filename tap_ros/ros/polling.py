@@ -26,7 +26,7 @@ from tap_ros.base.text import escaped
 from tap_ros.ros.topics import SERVICE_QOS
 
 WAIT_NS = 5 * 10**7  # after which a thread looks whether its node ends, or has more to wait for
-TAKING_S = 0.02  # after which those that were taken are answered
+TAKING_S = 0.5  # after which those that were taken are answered
 
 
 class PollOnlyGroup(CallbackGroup):

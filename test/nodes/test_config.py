@@ -116,7 +116,8 @@ def test_no_node_outlives_the_command_that_started_it(number, tmp_path):
 
 @pytest.mark.slow
 def test_a_planner_stops_the_arm_and_ends_when_who_started_it_is_killed(tmp_path):
-    code = COMMAND.replace('robot_mask_node', 'visual_mpc_node')
+    code = COMMAND.replace('robot_mask_node', 'visual_mpc_node').replace(
+        "start('visual_mpc_node'", "start('visual_mpc_node', preset='quick', max_age=30.0")
     with (subprocess.Popen([sys.executable, '-c', code, str(tmp_path)], stdout=subprocess.PIPE,
                            text=True) as command,
           Client() as node, World(node), tap_ros.Client(node=node) as client):
