@@ -25,6 +25,7 @@ os.environ.setdefault('MUJOCO_GL', 'egl')
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # experiments/ is not installed
 
+from experiments.bench.everything import processor  # noqa: E402
 from experiments.planning.episode import run_episode  # noqa: E402
 from experiments.planning.methods import parse_method  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
@@ -172,14 +173,7 @@ def trainings(folder):
 
 def machine():
     """Return what digests depend on beside the code: the processor, torch."""
-    info = Path('/proc/cpuinfo').read_text().splitlines()
-    model, flags = (next((line.partition(':')[2].strip() for line in info
-                          if line.startswith(word)), '?') for word in ('model name', 'flags'))
-    # Processors of one name differ in these.
-    known = {'amx_bf16': 'AMX', 'avx512_bf16': 'AVX-512 with bfloat16', 'avx512f': 'AVX-512',
-             'avx2': 'AVX2'}
-    best = next((name for flag, name in known.items() if flag in flags.split()), '')
-    return ' '.join(filter(None, [model, best, f'torch {torch.__version__.split("+")[0]}']))
+    return f'{processor()} torch {torch.__version__.split("+")[0]}'
 
 
 def make():

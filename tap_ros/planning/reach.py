@@ -234,12 +234,13 @@ class Reach:
 
     def _doubt(self, seen: Observation) -> str:
         """Say which objects can no longer be followed; an empty string if all can."""
-        lost = [name for name, state in zip(seen.names, seen.states) if state == LOST]
-        if lost:
+        if lost := [name for name, state in zip(seen.names, seen.states) if state == LOST]:
             return f'{listing(lost)} lost; see where it is, and select the objects again'
         for name, state in zip(seen.names, seen.states):
-            stamps = self._unsure.get(name, set()) | {seen.stamp_ns}
-            self._unsure[name] = stamps = stamps if state == UNSURE else set()
+            stamps = self._unsure.setdefault(name, set())
+            stamps.add(seen.stamp_ns)
+            if state != UNSURE:
+                stamps.clear()
             if len(stamps) >= MOST_UNSURE:
                 return (f'{name} is unsure in {len(stamps)} pictures in a row, the arm lifted; '
                         'see where it is, and select the objects again')
@@ -317,7 +318,6 @@ class Reach:
             plan = self._mpc.aside(seen.gripper, self.distance, state.memory, config.limits)
             self._next = replace(state, memory=plan.memory)
             return Command(plan, len(state.switches), seen)
-        # what to go to
         before = len(state.switches) - len(state.earlier)
         stage = itinerary.stage(self.steps - state.first_step, pixels, before)
         self._next = state = replace(
