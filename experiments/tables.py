@@ -217,13 +217,15 @@ class Tables:
                 '')
 
     def speed(self):
-        """List what `make bench` measured and has an aim; what limits it where that is missed."""
-        rows, differ = measured_speed()['rows'], origins()
-        for row in rows:
+        """List what `make bench` measured and has an aim, a column for each machine."""
+        found = {}
+        for row in measured_speed()['rows']:
             if row['aim']:
-                *cells, limit = Row(**{one.name: row[one.name] for one in fields(Row)}).cells
-                yield (*cells, '' if row['reached'] else limit,
-                       ', '.join(row[key] for key, values in differ.items() if len(values) > 1))
+                here, ratio = Row(**{one.name: row[one.name] for one in fields(Row)}).cells[1:3]
+                found.setdefault((row['what'], row['aim']), {})[row['machine']] = (
+                    f'{"" if row["reached"] else "**missed**: "}{here}; {ratio}')
+        for (what, aim), cells in found.items():
+            yield (what, *(cells.get(machine, '') for machine in machines()), aim)
 
 
 def measured_speed():
@@ -231,10 +233,13 @@ def measured_speed():
     return json.loads(SPEED.read_text())
 
 
-def origins():
-    """Return on which machines rows of speed with an aim were measured, of which commits, when."""
-    rows = [row for row in measured_speed()['rows'] if row['aim']]
-    return {key: {row[key] for row in rows} for key in ('machine', 'date', 'commit')}
+def machines():
+    """Return by each machine that rows of speed are of their commits and dates, in words."""
+    found = {}
+    for row in measured_speed()['rows']:
+        if row['aim']:
+            found.setdefault(row['machine'], {})[f'{row["commit"]} of {row["date"]}'] = None
+    return {machine: ', '.join(each) for machine, each in found.items()}
 
 
 def markdown(lines, head=('claim', 'paper', 'here', 'aim')):
@@ -253,9 +258,8 @@ def filled(name):
     text = page_path(name).read_text()
     head = {}
     if name == 'speed':
-        machines = origins()['machine']
-        head = {'head': ('what', machines.pop() if len(machines) == 1 else 'here', 'ratio', 'aim',
-                         'what limits it', 'measured')}
+        head = {'head': ('what', *(f'{machine} ({made})' for machine, made in machines().items()),
+                         'aim')}
     table = markdown(getattr(Tables(), name)(), **head)
     if not MARKS.search(text):
         raise ConfigError(f'{name}.md: expected <!-- table --> and <!-- end -->')

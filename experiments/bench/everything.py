@@ -3,8 +3,8 @@
 """
 All benchmarks, and their rows in docs/results/speed.json and on docs/speed.md.
 
-A row is written as soon as it is measured, in the place of the one that was there. So what is
-interrupted goes on, and a part that is measured by itself changes nothing else.
+A row is written as soon as it is measured, in the place of the one of this machine that was there.
+So what is interrupted goes on, and neither other parts nor other machines' rows change.
 """
 
 from dataclasses import asdict, dataclass
@@ -76,12 +76,15 @@ def measure(name, options):
 
 def change(name, found, is_all):
     """Put what was found of a part so far into the data, and the page's table made of them."""
-    data = tables.measured_speed()
+    data, machine = tables.measured_speed(), made_by()['machine']
     parts = {part: [row for row in data['rows'] if row['part'] == part] for part in PARTS}
     new = {row['what'] for row in found}
-    parts[name] = found + [row for row in parts[name] if not is_all and row['what'] not in new]
+    parts[name] = [row for row in parts[name] if row['machine'] != machine or not (
+        is_all or row['what'] in new)] + found
     data['rows'] = sum(parts.values(), [])
-    data['unfinished'] = sorted({*data['unfinished']} - {name} | {name} - {name * is_all})
+    unfinished = [name, machine]
+    data['unfinished'] = [one for one in data['unfinished'] if one != unfinished] + [
+        unfinished] * (not is_all)
     write_atomically(tables.SPEED, json.dumps(data, indent=1) + '\n')
     write_atomically(tables.page_path('speed'), tables.filled('speed'))
 
@@ -89,9 +92,11 @@ def change(name, found, is_all):
 def is_measured(name):
     """Return whether all rows of a part are of this machine and code."""
     data, origin = tables.measured_speed(), made_by()
-    rows = [row for row in data['rows'] if row['part'] == name]
-    return bool(rows) and name not in data['unfinished'] and not origin['commit'].endswith('+') \
-        and all(row[key] == origin[key] for row in rows for key in ('machine', 'commit', 'torch'))
+    rows = [row for row in data['rows']
+            if (row['part'], row['machine']) == (name, origin['machine'])]
+    return bool(rows) and [name, origin['machine']] not in data['unfinished'] \
+        and not origin['commit'].endswith('+') \
+        and all(row[key] == origin[key] for row in rows for key in ('commit', 'torch'))
 
 
 def made_by():

@@ -89,9 +89,10 @@ def test_rows_are_kept_as_they_are_measured_and_what_was_interrupted_goes_on(
                 raise KeyboardInterrupt
             yield Row(what, '1 s', 1.0, 'itself', 'at most 2 s')
 
-    def kept(key='commit'):
+    def kept(machine='one'):
         assert tables.filled('speed') == page.read_text()
-        return {row['what']: row[key] for row in tables.measured_speed()['rows']}
+        return {row['what']: row['commit'] for row in tables.measured_speed()['rows']
+                if row['machine'] == machine}
 
     page = tmp_path / 'speed.md'
     page.write_text('<!-- table -->\n<!-- end -->\n')
@@ -105,19 +106,28 @@ def test_rows_are_kept_as_they_are_measured_and_what_was_interrupted_goes_on(
     fails = ''
     everything.measure('start', Options())
     everything.measure('busy', Options(end='d'))  # not the default: printed alone
-    assert kept() == {'a': '1', 'b': '1', 'c': '1'} and '| one |' in page.read_text()
+    assert kept() == {'a': '1', 'b': '1', 'c': '1'} and '| one (1 of today) |' in page.read_text()
     assert everything.is_measured('start') and not everything.is_measured('busy')
     made, fails = made | {'commit': '2'}, 'b'
     assert not everything.is_measured('start')
     with pytest.raises(KeyboardInterrupt):
         everything.measure('start', Options())
     assert kept() == {'a': '2', 'b': '1', 'c': '1'} and not everything.is_measured('start')
-    assert '| 1 |' in page.read_text()
+    assert '(1 of today, 2 of today)' in page.read_text()
     fails = ''
     everything.run(everything.Options())
     assert kept() == {'a': '2', 'b': '2', 'c': '2'}
     assert [row['part'] for row in tables.measured_speed()['rows']] == [
         name for name in everything.PARTS for _ in 'abc']
+    made, fails = made | {'machine': 'two', 'commit': '3'}, 'b'
+    with pytest.raises(KeyboardInterrupt):
+        everything.measure('start', Options())
+    assert kept('two') == {'a': '3'} and kept() == {'a': '2', 'b': '2', 'c': '2'}
+    assert '| a | 1 s; 1.00 x itself | 1 s; 1.00 x itself | at most 2 s |' in page.read_text()
+    assert '| b | 1 s; 1.00 x itself |  | at most 2 s |' in page.read_text()
+    assert not everything.is_measured('start')
+    made = made | {'machine': 'one', 'commit': '2'}
+    assert everything.is_measured('start')
 
 
 def test_mppi_goes_to_the_least_cost():
