@@ -40,12 +40,11 @@ HARD_EPISODES = 8
 COVERED_TASKS = 'push2', 'order2'
 PALE_SCENES = 30
 CLICK_LINES = {
-    'refused': 'refused', 'selected_px': 'off at once, px', 'selected_within_2px': 'within 2 px',
+    'refused': 'refused', 'selected_within_2px': 'within 2 px',
     'later_within_2px': 'within 2 px at last', 'wrong_sure': 'wrong at last, seen'}
 LINES = {
     'median_px': 'median error, px', 'within_2px': 'within 2 px',
-    'wrong_sure': 'wrong, said to be seen', 'longest_wrong_sure': 'most pictures in a row',
-    'lost': 'lost at the end', 'goal_right': 'found in the goal',
+    'wrong_sure': 'wrong, said to be seen', 'goal_right': 'found in the goal',
     'goal_wrong': 'found there, wrong'}
 LABELS = 'tracking_labels.json'
 METHODS = ('shipped', 'shipped:tracked')  # of pushing
@@ -114,11 +113,13 @@ def page(rows, pushed):
     """Return the page of these rows, and of what loop returns."""
     rows = pd.DataFrame(rows)
     rows['light'] = rows.get('light', pd.Series(index=rows.index, dtype=object)).fillna('')
-    films = rows[rows.recording.str.endswith('.mp4')]
+    real = rows.recording.str.endswith('.mp4')
+    films, others = rows[real], rows[~real]
     return render('templates/tracking.md.j2', conditions=conditions(rows), clicks=clicks(rows),
-                  films=film_table(films), hard_episodes=HARD_EPISODES,
+                  films=of_films(films), hard_episodes=HARD_EPISODES,
                   places=f'{int(films[films.metric == "within_2px"].n.sum()):,}',
-                  cpu=pooled(rows[~rows.recording.isin(films.recording)], 'cpu_ms'),
+                  cpu=pooled(others, 'cpu_ms'),
+                  longest=pooled(others, 'longest_wrong_sure'), lost=pooled(others, 'lost'),
                   film_cpu=f'{films[films.metric == "cpu_ms"].value.max():.0f}',
                   lines=f'{code_lines():,}', real=len(films) > 0, loop=pushed, seed=SEED, off=OFF,
                   episodes=EPISODES)
@@ -161,12 +162,12 @@ def conditions(rows):
 
 def clicks(rows):
     """Return a table of single clicks."""
-    names = 'half hidden', 'lightness alone'
-    lines = [{'': line} | {name: pooled(rows[rows.recording == name], metric) for name in names}
-             for metric, line in CLICK_LINES.items()]
-    count = {name: f'{rows[(rows.recording == name) & (rows.metric == "refused")].n.sum():g}'
-             for name in names}
-    return pd.DataFrame([*lines, {'': 'clicks'} | count])
+    lines = []
+    for name in ('half hidden', 'lightness alone'):
+        mine = rows[rows.recording == name]
+        lines.append({'': name, 'clicks': f'{mine[mine.metric == "refused"].n.sum():g}'} | {
+            line: pooled(mine, metric) for metric, line in CLICK_LINES.items()})
+    return pd.DataFrame(lines)
 
 
 def loop(folder):
@@ -189,18 +190,15 @@ def loop(folder):
         'table': pd.DataFrame(lines), 'scenes': len(scenes), 'placed': len(placed),
         'placed_failed': sum(max(scene['objects_cm']) > REACHED_CM for scene in placed),
         'refused': sum('refused' in scene for scene in scenes),
-        'points': ' and '.join(f'{line["difference"]} in {task}' for task, line in zip(
-            PUSHED, lines)),
-        'asked': ' and '.join(f'{count} of {task}' for task, count in PUSHED.items()),
         'command': f'python -m experiments planning --tasks {" ".join(PUSHED)} --methods '
                    f'{" ".join(METHODS)} --scenes {len(min(tracked.values(), key=len))} '
                    '--no-films --out docs/results/tracking'}
 
 
-def film_table(rows):
-    """Return a table of films."""
-    some = {'within_2px': 'within 2 px', 'longest_wrong_sure': 'wrong, said to be seen: pictures',
-            'visible_lost': 'visible, lost'}
-    return pd.DataFrame([{'film': film} | {line: round(float(
-        mine[mine.metric == metric].value.iloc[0]), 2) for metric, line in some.items()}
-        for film, mine in rows.groupby('recording')])
+def of_films(rows):
+    """Return what the page says of films; within: share and number of each, least first."""
+    within, wrong, lost = (rows[rows.metric == metric].set_index('recording').value for metric in (
+        'within_2px', 'longest_wrong_sure', 'visible_lost'))
+    return {'within': [(f'{100 * value:.0f}%', int(film.partition('/')[0]))
+                       for film, value in within.sort_values().items()],
+            'wrong': f'{wrong.max():.0f}', 'lost': f'{100 * lost.max():.0f}%'}

@@ -8,6 +8,7 @@ Demonstrations of other simulators, keyframes of them, and predictors trained on
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+import re
 from typing import Literal, NamedTuple
 
 import cv2
@@ -51,6 +52,7 @@ ASIDE = {'metaworld/faucet-open-v3': 0, 'metaworld/dial-turn-v3': 0, 'metaworld/
          'metaworld/button-press-topdown-v3': 5000, 'ogbench/drawer': 5000, 'ogbench/puzzle': 0}
 FOUND = 0.75, 0.85  # of the demonstrations, exactly or within a frame: a task counts as found
 FRAMES = 'frames, in the bottleneck'  # a column
+KINDS = 'own', 'aside', 'without'  # tasks by TASKS; kept aside; trained without marks
 
 
 @dataclass(frozen=True)
@@ -219,16 +221,16 @@ def average(rows):
 
 def page(rows):
     """Write the page of the results, a line for each task."""
-    lengths, (tables, found) = {}, (
-        {kind: {} for kind in ('keyframes', 'labelled', 'without', 'aside')} for _ in range(2))
+    lengths, (tables, found) = {}, ({kind: {} for kind in KINDS} for _ in range(2))
     for row in rows:
         task, method, hit, near = (row[name] for name in ('task', 'method', 'hit', 'near'))
-        kind = ('aside' if task.startswith('aside/') else 'keyframes' if 'seeds' not in row else
-                'labelled' if method in WITH_MARKS else 'without')
+        kind = ('aside' if task.startswith('aside/') else 'own' if 'seeds' not in row
+                or method in WITH_MARKS else 'without')
         if 'seeds' not in row:
             lengths[task] = f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f}"
         line = tables[kind].setdefault(task, {
-            'task': task.removeprefix('aside/').replace('/', ' '), FRAMES: lengths[task]})
+            'task': re.sub('^(aside/)?(metaworld/)?', '', task).replace('/', ' '),
+            FRAMES: lengths[task]})
         line[method] = f"{hit['value']:.0%}, {near['value']:.0%}" + (
             f"; {row['error']['value']:.2f}" if 'error' in row else '')
         found[kind].setdefault(method, []).append(
@@ -236,8 +238,9 @@ def page(rows):
     for kind, lines in tables.items():
         lines['found'] = {'task': '**found**', FRAMES: ''} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
-    return render('worlds/templates/worlds.md.j2', marked=MARKED, more=compare(rows), **{
-        kind: pd.DataFrame(list(lines.values())) for kind, lines in tables.items()})
+    return render('worlds/templates/worlds.md.j2', marked=MARKED, more=compare(rows), found=found,
+                  **{kind: pd.DataFrame(list(lines.values())).drop(
+                      columns='middle', errors='ignore') for kind, lines in tables.items()})
 
 
 def compare(rows):
