@@ -24,6 +24,7 @@ METHODS = {
 }
 WITH_MARKS = 'marks', 'three pictures'
 SETTINGS = {'recipe': 'foreign', 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
+CUTS = {'ogbench/cube': '24,20,96'}  # --crop, px of 128: where hand and cube move
 
 
 def held_out_of(folder):
@@ -59,7 +60,8 @@ def mark(folder, demonstrations, seed):
 def train_all(folders, methods, seeds, out, engine):
     """Train and score all that is not done; return rows of what train_and_score returns."""
     work = [Work(f'{task}/{method}/{seed}', train_and_score, (
-                str(folder), method, seed, str(Path(out, task, f'{method}_{seed}'))))
+                str(folder), method, seed, str(Path(out, task, f'{method}_{seed}')),
+                CUTS.get(task, '')))
             for seed in range(seeds) for task, folder in folders.items() for method in methods]
     rows = []
     with tqdm(total=len(work), unit='training') as bar:
@@ -70,7 +72,7 @@ def train_all(folders, methods, seeds, out, engine):
     return rows
 
 
-def train_and_score(folder, method, seed, out):
+def train_and_score(folder, method, seed, out, crop=''):
     """
     Train a predictor and score it on the held-out episodes whose bottleneck is known.
 
@@ -94,7 +96,7 @@ def train_and_score(folder, method, seed, out):
     Path(out).mkdir(parents=True, exist_ok=True)
     with open(Path(out, 'log.txt'), 'a') as log, redirect_stderr(log):
         weights = train(folder, out, seed=seed, held_out=(str(held_out_of(folder)),),
-                        **SETTINGS, **METHODS[method], **marks)
+                        crop=crop, **SETTINGS, **METHODS[method], **marks)
     network, training = load_network(weights)
     bag = held_out_of(folder)
     store = open_recordings([bag], reading=reading_like(training, [bag]))
