@@ -57,9 +57,9 @@ def modules():
 
 
 def layers():
-    """Return what each row of the table in docs/architecture.md names, as modules."""
+    """Return what each point of the list in docs/architecture.md names, as modules."""
     section = (ROOT / 'docs' / 'architecture.md').read_text().split('\n## Folders\n')[1]
-    rows = re.findall(r'^\| (`.*?) \|', section.split('\n## ')[0], re.MULTILINE)
+    rows = re.findall(r'^- (`[^:]*`):', section.split('\n## ')[0], re.MULTILINE)
     return [[name.removesuffix('.py').strip('/').replace('/', '.')
              for name in re.findall('`(.*?)`', row)] for row in rows]
 
