@@ -256,6 +256,7 @@ def write_results(runs, out, args):
         write_rows(out / f'{page}.json', rows)
         values = {'table': summarise(rows), 'marked': MARKED, 'episodes': args.episodes,
                   'steps': args.steps, 'predictor_steps': args.predictor_steps,
+                  'start': f'{np.mean([row["start_cm"] for row in rows]):.1f}',
                   'budget': BUDGETS['push-wall-v3'],
                   'dropped': {method: dropped(rows, method) for method in LEARNED},
                   'more': ahead([row for row in rows if row['task'] in WAYS])}
@@ -297,14 +298,12 @@ def summarise(rows):
     found = []
     for (task, method), same in pd.DataFrame(rows).groupby(['task', 'method'], sort=False):
         scenes = same.groupby('seed', sort=False)
-        line = {'task': task, 'method': method, 'scenes': scenes.ngroups,
+        line = {'task': task.rpartition('/')[2], 'method': method, 'scenes': scenes.ngroups,
                 'trainings': same['training'].nunique() if method in LEARNED else None}
-        for name, head in (('ends', 'success at the end'), ('ever', 'at any step')):
-            mean = scenes[name].mean()
-            line[head] = share(share_interval(mean.tolist()) if set(mean) <= {0, 1}
-                               else mean_interval(mean.tolist()))
-        for name, head in (('start_cm', 'start, cm'), ('final_cm', 'end, cm')):
-            value, low, high = mean_interval(scenes[name].mean().tolist())
-            line[head] = f'{value:.1f} ({low:.1f} to {high:.1f})'
+        mean = scenes['ends'].mean()
+        line['success'] = share(share_interval(mean.tolist()) if set(mean) <= {0, 1}
+                                else mean_interval(mean.tolist()))
+        value, low, high = mean_interval(scenes['final_cm'].mean().tolist())
+        line['end, cm'] = f'{value:.1f} ({low:.1f} to {high:.1f})'
         found.append({**line, 'commands': f'{np.mean(same["steps"]):.0f}'})
     return pd.DataFrame(found).astype({'trainings': 'Int64'})
