@@ -27,9 +27,9 @@ MAX_REASONS = 4
 HEAD = """\
 # Faults
 
-Each row is a fault that was injected into real nodes, during a goal unless it says otherwise, or
-into a disk. *Held*: trials that ended as they must, without a traceback or an unexplained error in
-a log. *Seen*: the worst of all trials unless said otherwise. Made by `{command}` in
+A row is a fault of real nodes, during a goal unless it says otherwise, or of a disk. *Held*:
+trials that ended as they must, without a traceback or an unexplained error in a log. *Seen*: the
+worst trial unless said otherwise. Made by `{command}` in
 {minutes:.0f} minutes, {dates}, commit {commits}, on {machines}; data:
 [faults.json](faults.json).
 
