@@ -179,8 +179,10 @@ def loop(folder):
     for task in PUSHED:
         gap = said(task, 'success_5cm_difference', compares='tracking')
         true, mine = (number(said(task, 'success_5cm', method), 100) for method in METHODS)
+        left = (f"{said(task, 'final_distance_cm', method)['value']:.1f}" for method in METHODS)
         lines.append({'': task, 'true pixels': true, 'tracked': mine, 'scenes': gap.n,
-                      'difference': number(gap, 100, 0, ' points', '+')})
+                      'difference': number(gap, 100, 0, ' points', '+'),
+                      'cm left, true and tracked': ', '.join(left)})
         tracked[task] = json.loads(Path(
             folder, 'planning', f'{task}-{METHODS[1].replace(":", "--")}.json').read_text())[
                 'scenes']
