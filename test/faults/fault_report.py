@@ -27,16 +27,14 @@ MAX_REASONS = 4
 HEAD = """\
 # Faults
 
-A row is a fault of real nodes, during a goal unless it says otherwise, or of a disk. *Held*:
-trials that ended as they must, without a traceback or an unexplained error in a log. *Seen*: the
-worst trial unless said otherwise. Made by `{command}` in
+Each line has a fault of real nodes, during a goal unless it says otherwise, or of a disk; what
+must happen; in how many of the trials it did, without a traceback or an unexplained error in a
+log; and the worst trial, unless said otherwise. Made by `{command}` in
 {minutes:.0f} minutes, {dates}, commit {commits}, on {machines}; data:
 [faults.json](faults.json).
 
 ![slowest reaction of all trials (bars), and what was promised (lines)](faults.png)
 
-| injected | must happen | held | seen |
-| --- | --- | ---: | --- |
 """
 
 
@@ -189,17 +187,17 @@ def page(rows):
 
 
 def _line(injected, promise, rows):
-    """Return one line of the table."""
+    """Return one line of the page."""
     tried, held = (sum(row[key] for row in rows) for key in ('tried', 'held'))
     figures = [row['figure'] for row in rows if row['figure'] is not None]
-    seen = ' / '.join(f'{figure:.3g}' if isinstance(figure, float) else figure
+    seen = ', '.join(f'{figure:.3g}' if isinstance(figure, float) else figure
                       for figure in figures)
     what = re.sub(r'^s (?:until|for) [a-z ]+', 's ', rows[0]['what']).strip()  # 's (median)'
-    parts = [f'{seen} {what}'.strip() if figures else '',
-             *(row['why_not'] for row in rows)]
-    words = '; '.join(filter(None, parts)).replace('|', '\\|').replace('<', '\\<')
-    share = f'{held} of {tried}'
-    return f'| {injected} | {promise} | {share if held == tried else f"**{share}**"} | {words} |\n'
+    share = f'{held}/{tried}'
+    parts = [share if held == tried else f'**{share}**',
+             f'{seen} {what}'.strip() if figures else '', *(row['why_not'] for row in rows)]
+    words = '; '.join(filter(None, parts)).replace('<', '\\<')
+    return f'- **{injected}**: {promise}. {words}\n'
 
 
 def describe_machine():

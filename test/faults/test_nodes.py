@@ -35,8 +35,7 @@ NAMES = (f'red\n{FORGED}', f'\x1b[31m{FORGED}\x1b[0m', f'a\r{FORGED}', f'a\x85{F
                                   'recorder_node'))
 @pytest.mark.errors('nothing was recorded')
 @fault('a node is started and ended at any moment', f'ends within {END_S:g} s, exit code 0 (130 '
-       'or the signal during imports, 1 of an empty recorder), no traceback', 50,
-       's until it had ended')
+       'or the signal during imports, 1 of an empty recorder)', 50, 's until it had ended')
 def test_start_stop(trials, tmp_path, name):
     random = np.random.default_rng(0)
 
@@ -88,7 +87,7 @@ def test_start_stop(trials, tmp_path, name):
     ids=lambda given: next(iter(given)))
 @pytest.mark.errors('nothing was recorded')
 @fault('unknown parameters, or weights by name, to each node', 'it works, or one line in the log '
-       'names the parameter; no traceback', 2 * len(NODE_CLASSES))
+       'names the parameter', 2 * len(NODE_CLASSES))
 def test_parameters(trials, tmp_path, given):
     (parameter, value), = given.items()
     for trial in trials:
