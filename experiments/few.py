@@ -13,7 +13,7 @@ from pathlib import Path
 
 from experiments.pages import render, share
 from experiments.paper.figures import COLOURS, INK, new_figure, to_png
-from experiments.tables import markdown, reached
+from experiments.tables import said
 from experiments.worlds.command import read
 from experiments.worlds.trained import held_out_of, mark, MARKED, marks_of
 import numpy as np
@@ -164,20 +164,19 @@ def relative(rows):
 
 
 def lines(found):
-    """Return the lines of the table: claim, paper, here, aim."""
+    """Return the lines of the list."""
     for count in dict.fromkeys(row['demonstrations'] for row in found['curve']):
         rows = [row for row in found['curve'] if row['demonstrations'] == count]
         beside = np.array([row['beside'] for row in rows])
         hit, near = (share(mean_interval((beside <= most).mean(0))) for most in (0, 1))
-        yield _line(f'{count} simulated', rows, f'; {hit}; {near}')
+        yield _line(f'{count} simulated', rows, f', {hit}, {near}')
     if found['real']:
         yield _line(f'{len(found["real"])} real', found['real'])
 
 
 def _line(which, rows, more=''):
     ratio = relative(rows)[1]
-    return (f'{which} demonstrations', '', '{:.2f} ({:.2f} to {:.2f})'.format(*ratio) + more,
-            reached(ratio.high < 1, 'below 1'))
+    return said(f'- {which}: ' + '{:.2f} ({:.2f} to {:.2f})'.format(*ratio) + more, ratio.high < 1)
 
 
 def draw(found):
@@ -208,4 +207,4 @@ def page(found):
     return render('templates/few.md.j2', task=found['task'], marked=MARKED, held_out=HELD_OUT,
                   steps=SETTINGS['steps'], batch=SETTINGS['batch_size'],
                   seeds=1 + max(row['seed'] for row in found['curve']),
-                  table=markdown(lines(found)), real=real)
+                  lines=lines(found), real=real)

@@ -1,13 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The tables of docs/results, from the data beside the pages.
+The numbers of docs/results, from the data beside the pages.
 
     python -m experiments.tables
 
-A page has its sentences from a person, and its table between two marks from here. Numbers have
-their 95% intervals in brackets. A row is reached if its number is at least the paper's; where the
-aim is `over` something, if the interval is.
+A page has its sentences from a person, and its numbers between two marks from here: lists, on
+docs/speed.md a table. Numbers have their 95% intervals in brackets. A number is missed unless it
+is at least the paper's; where there is none, unless the interval is.
 """
 
 from dataclasses import fields
@@ -32,7 +32,7 @@ MARKS = re.compile(r'(<!-- table -->\n).*?(<!-- end -->)', re.DOTALL)
 OURS = 'genmin-wo-gan{}+skips'  # our network without GAN; {}: the selection
 RELATIVE, PROGRESS, FIX = OURS.format('+relative'), OURS.format('+progress'), 'fix-wo-gan+skips'
 PIECES = (PROGRESS, f'{PROGRESS}+pieces')  # trained on whole episodes, and on pieces
-TASKS = {'grasp': 'grasping', 'pick_place': 'pick-and-place', 'push2': 'pushing two objects'}
+TASKS = {'grasp': 'grasping', 'pick_place': 'pick-and-place', 'push2': 'pushing'}
 
 
 def find(folder, file, **wanted):
@@ -66,8 +66,13 @@ def reached(yes, *aim):
     return ': '.join(('reached' if yes else '**missed**', *aim))
 
 
+def said(text, yes=True):
+    """Return a text, and whether what it says was missed."""
+    return text if yes else f'{text}, **missed**'
+
+
 class Tables:
-    """The lines of each page's table: claim, paper, here, reached or missed."""
+    """The lines of each page: lists in Markdown, of speed cells of a table."""
 
     def prediction(self):
         """Compare the paper's claims about prediction with what was measured."""
@@ -79,54 +84,52 @@ class Tables:
         def found(method, task='push2'):
             return row(method, 'bottleneck_frequency_2px', task, new_pixels=False)
 
-        def some(claim, measured, papers=(), said=''):
-            """Return one line of several numbers, each with that of the paper."""
-            if not papers:
-                aims = [reached(each['ci_low'] > 0) for each in measured]
-                return (claim, said, '; '.join(number(each, 100) for each in measured),
-                        '; '.join(aims if len(set(aims)) > 1 else aims[:1]) + ': over 0')
-            return (claim, '; '.join(dict.fromkeys(
-                f'{paper:.1%}'.replace('.0%', '%') for paper in papers)),
-                '; '.join(number(each, 100) for each in measured), '; '.join(
-                    reached(each['value'] >= paper)
-                    for each, paper in zip(measured, papers, strict=True)))
+        def line(claim, measured, least=None):
+            """Return one line of several numbers; `least` has of each what the paper has."""
+            least = least or {}
+            papers = ', '.join(dict.fromkeys(
+                f'{paper:.1%}'.replace('.0%', '%') for paper in least.values()))
+            return f'- {claim}{f" (paper: {papers})" if papers else ""}: ' + '; '.join(
+                said(f'{name} {number(each, 100)}', each['value'] >= least[name] if least
+                     else each['ci_low'] > 0) for name, each in measured.items())
 
-        def two(claim, ours, fix):
-            return (f'{claim}: `genmin`; `fix`', '', f'{number(ours, 100)}; {number(fix, 100)}',
-                    reached(ours['ci_low'] > fix['ci_high'], 'over `fix`'))
+        def pair(name, ours, fix):
+            return said(f'{name} {number(ours, 100)}, `fix` {number(fix, 100)}',
+                        ours['ci_low'] > fix['ci_high'])
 
-        plain, tasks = OURS.format(''), '; '.join(TASKS.values())
-        for method, network in ((plain, ''), ('genmin', "the paper's network with GAN, ")):
-            yield some(f'`genmin` below `fix`: {network}{tasks}',
-                       [row(method, task=task) for task in TASKS], [*map(GAINS.get, TASKS)])
-        yield some(f'`genmin` below `fix` at the same match-step: {tasks}', [
-            row(plain, 'gain_over_fix_at_match_step', task) for task in TASKS])
-        yield some('`genmin` below `fix`: stacking two blocks; pushing three', [
-            row(plain, task=task) for task in ('stack2', 'push3')])
-        yield two('predictions that show hand and object, pick-and-place',
-                  *(row(method, 'shows_both', 'pick_place') for method in (plain, FIX)))
-        yield some('`genmin`, beta 4, below fixed times at the same match-step: grasping, from '
-                   'the start alone', [row(
-                       'genmin4-wo-gan+skips', 'gain_over_fix_at_match_step', 'grasp',
-                       mode='forward')], said='lower')
-        bottlenecks = 'bottlenecks found, pushing two objects'
-        yield some(f'{bottlenecks}: `genmin`; over progress; relative to copying', [
-            found(method) for method in (plain, PROGRESS, RELATIVE)],
-            3 * [BOTTLENECK_2PX['genmin']])
-        yield (f'{bottlenecks}: `fix` finds none', f'{BOTTLENECK_2PX["fix"]:.0%}',
-               number(found(FIX), 100), reached(found(FIX)['value'] == 0))
-        for task, title in (('push2_late', 'late in the recordings'),
-                            ('push2_mixed', 'at any time'),
-                            ('order2', 'two objects in order'), ('push3', 'three objects')):
-            yield two(f'bottlenecks found, {title}, relative to copying', found(RELATIVE, task),
-                      found(FIX, task))
-        yield some(f'best of 100 samples below the best without: {tasks}', [
-            row(f'genmin-vae-wo-gan-best-of-100+skips{form}', 'gain_over_deterministic', task)
-            for task, form in zip(TASKS, ('', '+narrow', '+frame'), strict=True)], said='lower')
-        yield some('recursion, pick-and-place, over progress: pick before place, trained on whole '
-                   'episodes; on pieces', [
-                       row(method, 'pick_after_place', 'pick_place') for method in PIECES],
-                   said='shown')
+        plain = OURS.format('')
+        gains = {title: GAINS[task] for task, title in TASKS.items()}
+        for method, network in ((plain, ''), ('genmin', ", the paper's network with GAN")):
+            yield line(f'`genmin` below `fix`{network}', {
+                title: row(method, task=task) for task, title in TASKS.items()}, gains)
+        yield line('`genmin` below `fix` at the same match-step', {
+            title: row(plain, 'gain_over_fix_at_match_step', task)
+            for task, title in TASKS.items()})
+        yield line('`genmin` below `fix`', {
+            title: row(plain, task=task) for task, title in (
+                ('stack2', 'stacking two blocks'), ('push3', 'pushing three'))})
+        yield line('`genmin` of beta 4 below fixed times at the same match-step', {
+            'grasping from the start alone': row(
+                'genmin4-wo-gan+skips', 'gain_over_fix_at_match_step', 'grasp', mode='forward')})
+        yield '- predictions that show hand and object, pick-and-place: ' + pair('`genmin`', *(
+            row(method, 'shows_both', 'pick_place') for method in (plain, FIX)))
+        ways = {'`genmin`': plain, 'over progress': PROGRESS, 'relative to copying': RELATIVE}
+        yield line('bottlenecks found, pushing', {
+            name: found(method) for name, method in ways.items()},
+            dict.fromkeys(ways, BOTTLENECK_2PX['genmin']))
+        yield said('- bottlenecks found by `fix`, pushing (paper: none): '
+                   + number(found(FIX), 100), found(FIX)['value'] <= BOTTLENECK_2PX['fix'])
+        yield '- bottlenecks found, relative to copying: ' + '; '.join(
+            pair(title, found(RELATIVE, task), found(FIX, task)) for task, title in (
+                ('push2_late', 'late in the recordings'), ('push2_mixed', 'at any time'),
+                ('order2', 'two objects in order'), ('push3', 'three objects')))
+        yield line('best of 100 samples below the best without', {
+            title: row(f'genmin-vae-wo-gan-best-of-100+skips{form}', 'gain_over_deterministic',
+                       task)
+            for (task, title), form in zip(TASKS.items(), ('', '+narrow', '+frame'))})
+        yield line('recursion over progress, pick-and-place, pick before place', {
+            title: row(method, 'pick_after_place', 'pick_place') for title, method in zip(
+                ('trained on whole episodes', 'on pieces'), PIECES)})
 
     def planning(self):
         """Compare the paper's claims about planning with what was measured."""
@@ -140,51 +143,52 @@ class Tables:
         def points(row):
             return number(row, 100, 0, ' points', '+')
 
+        yield 'Directly, via the subgoal, and the difference (aim: all of its interval better):\n'
         for task, title in (('push2', 'two'), ('push3', 'three')):
             paper = [TABLE_2[task, method][0] for method in ('direct', 'genmin')]
             less = final(task, 'shipped', 'final_distance_difference_cm', compares='direct')
-            yield (f'final distance, {title} objects anywhere: direct; via the subgoal; '
-                   'difference (paper: {} cm; {} cm; {:.1f} cm)'.format(
-                       *paper, paper[1] - paper[0]), '',
-                   '; '.join(number(row, 1, 1, ' cm') for row in (
-                       final(task, 'direct'), final(task, 'shipped'), less)),
-                   reached(less['ci_high'] < 0, 'nearer'))
+            yield said(f'- final distance, {title} objects anywhere: ' + ', '.join(
+                number(row, 1, 1, ' cm') for row in (
+                    final(task, 'direct'), final(task, 'shipped'), less)) + (
+                        ' (paper: {} cm, {} cm, {:.1f} cm)'.format(*paper, paper[1] - paper[0])),
+                less['ci_high'] < 0)
         for task, shipped, title in (
                 ('push2', 'shipped', 'two objects anywhere'),
                 ('push3', 'shipped', 'three objects anywhere'),
                 ('order2', 'shipped', 'two in order'),
                 ('order3', 'shipped:rounds2', 'three in order, two predictions')):
             more = success(task, shipped, compares='direct')
-            yield (f'{title}: direct; via the subgoal; difference', '', '; '.join((
+            yield said(f'- {title}: ' + ', '.join((
                 number(success(task, 'direct'), 100), number(success(task, shipped), 100),
-                points(more))), reached(more['ci_low'] > 0, 'over direct'))
-        late3 = 'order3', 'fix+late:rounds2', 'genmin+relative+late:rounds2'
-        for task, fix, ours, title, *file in (
+                points(more))), more['ci_low'] > 0)
+        yield '\nVia `fix`, and how much higher it is via the subgoal (aim: 20 points):\n'
+        for task, fix, ours, title in (
                 ('order2', 'fix', 'shipped', 'two in order'),
                 ('order3', 'fix+rounds:rounds2', 'shipped:rounds2', 'three in order'),
-                ('order2', 'fix+rounds', 'genmin+relative+rounds', 'two in order, trained alike'),
-                ('order2', 'fix+late', 'genmin+relative+late', 'two in order, late'),
-                (*late3, 'three in order, late', LATE)):
-            more = success(task, ours, *file, compares='fix')
-            yield (f'{title}: via `fix`; difference', '', '; '.join((
-                number(success(task, fix, *file), 100), points(more))),
-                reached(more['value'] >= 0.2, '20 points'))
-        for compares, title in (('fix', '`fix`'), ('direct', 'direct')):
-            more = [success('order2', f'genmin+relative+late{seed}', file, compares=compares)
-                    for seed, file in (('', PLANNING), ('-s1', LATE), ('-s2', LATE))]
-            yield (f'two in order, late, three trainings: difference from {title}',
-                   '', '; '.join(map(points, more)), reached(
-                       sum(row['value'] for row in more) / 3 >= 0.2
-                       and min(row['ci_low'] for row in more) > 0, '20 points'))
-        more = success(*late3[::2], LATE, compares='direct')
-        yield ('three in order, late: difference from direct', '', points(more),
-               reached(more['value'] >= 0.2, '20 points'))
-        yield ('told the right order: two; three in order', '', '; '.join(
-            number(success(task, 'oracle_order'), 100) for task in ('order2', 'order3')),
-            '')
-        yield ('with the simulator as forward model, direct: two anywhere; two in order',
-               '', '; '.join(number(success(task, 'true_model'), 100)
-                             for task in ('push2', 'order2')), '')
+                ('order2', 'fix+rounds', 'genmin+relative+rounds', 'two in order, trained alike')):
+            more = success(task, ours, compares='fix')
+            yield said(f'- {title}: {number(success(task, fix), 100)}, {points(more)}',
+                       more['value'] >= 0.2)
+        late = 'genmin+relative+late'
+        for task, fix, title, *trainings in (
+                ('order2', 'fix+late', 'two in order, late, three trainings', (late, PLANNING),
+                 (f'{late}-s1', LATE), (f'{late}-s2', LATE)),
+                ('order3', 'fix+late:rounds2', 'three in order, late', (f'{late}:rounds2', LATE))):
+            than_fix, than_direct = (
+                said(', '.join(map(points, more)), min(row['ci_low'] for row in more) > 0
+                     and sum(row['value'] for row in more) >= 0.2 * len(more))
+                for more in ([success(task, *ours, compares=compares) for ours in trainings]
+                             for compares in ('fix', 'direct')))
+            yield (f'- {title}: {number(success(task, fix, trainings[0][1]), 100)}, {than_fix}; '
+                   f'than directly {than_direct}')
+        yield '\nFor comparison:\n'
+        for title, method, tasks in (
+                ('told the right order', 'oracle_order',
+                 {'order2': 'two in order', 'order3': 'three'}),
+                ('directly, with the simulator as forward model', 'true_model',
+                 {'push2': 'two anywhere', 'order2': 'in order'})):
+            yield f'- {title}: ' + ', '.join(
+                f'{name} {number(success(task, method), 100)}' for task, name in tasks.items())
 
     def stacking(self):
         """Say how many towers stand."""
@@ -200,19 +204,18 @@ class Tables:
         direct = row('stack3', 'direct')
         for method, title in methods.items():
             stands, first = row('stack3', method), row('stack3', method, 'first_right')
-            aimed = reached(stands['ci_low'] > direct['ci_high'], 'over the goal picture alone')
-            yield (title, '',
-                   f'{number(stands, 100)}; {number(first, 100)}',
-                   aimed if 'shipped' in method else '')
+            yield said(f'- {title}: {number(stands, 100)}, {number(first, 100)}',
+                       'shipped' not in method or stands['ci_low'] > direct['ci_high'])
         for other, title, least, aim in (('fix', 'via `fix`', 0.2, '20 points'),
-                                         ('lowest_first', 'the rule', 0, 'over the rule')):
+                                         ('lowest_first', 'the rule', 0, 'over 0')):
             more = row('stack3', 'shipped', 'success_difference', against=other)
-            yield (f'via one subgoal minus {title}', '',
-                   number(more, 100, 0, ' points', '+'),
-                   reached(more['value'] >= least and more['ci_low'] > 0, aim))
-        yield ('two blocks: the goal picture alone; via one subgoal; via two', '', '; '.join(
-            number(row('stack2', method), 100)
-            for method in ('direct', 'shipped', 'shipped:recursion2')), '')
+            yield said(f'- via one subgoal minus {title} (aim: {aim}): '
+                       + number(more, 100, 0, ' points', '+'),
+                       more['value'] >= least and more['ci_low'] > 0)
+        yield '- two blocks: ' + ', '.join(
+            f'{title} {number(row("stack2", method), 100)}' for method, title in (
+                ('direct', 'the goal picture alone'), ('shipped', 'via one subgoal'),
+                ('shipped:recursion2', 'via two')))
 
     def speed(self):
         """List what `make bench` measured and has an aim, a column for each machine."""
@@ -240,28 +243,23 @@ def machines():
     return {machine: ', '.join(each) for machine, each in found.items()}
 
 
-def markdown(lines, head=('claim', 'paper', 'here', 'aim')):
-    """Write lines as a table, without the columns that are empty."""
-    table = pd.DataFrame(lines, columns=head)
-    return pages.markdown(table.loc[:, (table != '').any()], left=len(head)) + '\n'
-
-
 def page_path(name):
     """Return where a page is."""
     return RESULTS.parent / 'speed.md' if name == 'speed' else RESULTS / f'{name}.md'
 
 
 def filled(name):
-    """Return a page, 'prediction', 'planning', 'stacking' or 'speed', with its table anew."""
+    """Return a page, 'prediction', 'planning', 'stacking' or 'speed', with its numbers anew."""
     text = page_path(name).read_text()
-    head = {}
+    lines = list(getattr(Tables(), name)())
     if name == 'speed':
-        head = {'head': ('what', *(f'{machine} ({made})' for machine, made in machines().items()),
-                         'aim')}
-    table = markdown(getattr(Tables(), name)(), **head)
+        head = 'what', *(f'{machine} ({made})' for machine, made in machines().items()), 'aim'
+        made = pages.markdown(pd.DataFrame(lines, columns=head), left=len(head))
+    else:
+        made = '\n'.join(lines)
     if not MARKS.search(text):
         raise ConfigError(f'{name}.md: expected <!-- table --> and <!-- end -->')
-    return MARKS.sub(lambda found: found[1] + table + found[2], text)
+    return MARKS.sub(lambda found: f'{found[1]}{made}\n{found[2]}', text)
 
 
 if __name__ == '__main__':
