@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 from experiments.pages import markdown, render
-from experiments.tables import reached
+from experiments.tables import said
 import numpy as np
 from pandas import DataFrame
 from PIL import Image
@@ -192,15 +192,13 @@ def table(found: dict[str, list[dict[str, float]]]) -> str:
     for row, scores in found.items():
         each = {way: np.array([score[way] for score in scores]) for way in WAYS}
         ours, aim = mean_interval(each['full']), AIMS[row]
-        line: dict[str, Any] = {
-            'weights': row.partition(' ')[0],
-            'against': 'true picture' if truth_is_known(row) else 'nearest demonstrated frame'}
+        line: dict[str, Any] = {'weights': row.replace(' ', ', ')}
         for way, name in WAYS.items():
             line[name] = f'{each[way].mean():.2f}'
         line[WAYS['full']] = '{:.2f} ({:.2f} to {:.2f})'.format(*ours)
-        line['aim'] = '' if aim is None else reached(ours.value <= aim, f'{aim:g}')
+        line['aim'] = '' if aim is None else said(f'{aim:g}', ours.value <= aim)
         lines.append(line)
-    return markdown(DataFrame(lines), 2)
+    return markdown(DataFrame(lines))
 
 
 def truth_is_known(row: str) -> bool:

@@ -61,11 +61,6 @@ def number(row, unit=1.0, digits=0, after='%', sign=''):
     return f'{value}{after} ({low} to {high})'
 
 
-def reached(yes, *aim):
-    """Return whether an aim is reached."""
-    return ': '.join(('reached' if yes else '**missed**', *aim))
-
-
 def said(text, yes=True):
     """Return a text, and whether what it says was missed."""
     return text if yes else f'{text}, **missed**'
