@@ -136,16 +136,17 @@ class Tables:
             return find(RESULTS, file, task=task, method=method, metric=metric, **about)
 
         def points(row):
-            return number(row, 100, 0, ' points', '+')
+            return number(row, 100, 0, '', '+')
 
-        yield 'Directly, via the subgoal, and the difference (aim: all of its interval better):\n'
+        yield ('Directly, via the subgoal, and the difference in points (aim: all of its interval '
+               'better):\n')
         for task, title in (('push2', 'two'), ('push3', 'three')):
             paper = [TABLE_2[task, method][0] for method in ('direct', 'genmin')]
             less = final(task, 'shipped', 'final_distance_difference_cm', compares='direct')
-            yield said(f'- final distance, {title} objects anywhere: ' + ', '.join(
-                number(row, 1, 1, ' cm') for row in (
+            yield said(f'- final distance in cm, {title} objects anywhere: ' + ', '.join(
+                number(row, 1, 1, '') for row in (
                     final(task, 'direct'), final(task, 'shipped'), less)) + (
-                        ' (paper: {} cm, {} cm, {:.1f} cm)'.format(*paper, paper[1] - paper[0])),
+                        '; paper: {}, {}, {:.1f}'.format(*paper, paper[1] - paper[0])),
                 less['ci_high'] < 0)
         for task, shipped, title in (
                 ('push2', 'shipped', 'two objects anywhere'),
@@ -156,7 +157,7 @@ class Tables:
             yield said(f'- {title}: ' + ', '.join((
                 number(success(task, 'direct'), 100), number(success(task, shipped), 100),
                 points(more))), more['ci_low'] > 0)
-        yield '\nVia `fix`, and how much higher it is via the subgoal (aim: 20 points):\n'
+        yield '\nVia `fix`, and how many points more via the subgoal (aim: 20):\n'
         for task, fix, ours, title in (
                 ('order2', 'fix', 'shipped', 'two in order'),
                 ('order3', 'fix+rounds:rounds2', 'shipped:rounds2', 'three in order'),
