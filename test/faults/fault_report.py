@@ -190,8 +190,8 @@ def _line(injected, promise, rows):
     """Return one line of the page."""
     tried, held = (sum(row[key] for row in rows) for key in ('tried', 'held'))
     figures = [row['figure'] for row in rows if row['figure'] is not None]
-    seen = ', '.join(f'{figure:.3g}' if isinstance(figure, float) else figure
-                      for figure in figures)
+    seen = ', '.join(dict.fromkeys(  # equal ones once
+        f'{figure:.3g}' if isinstance(figure, float) else figure for figure in figures))
     what = re.sub(r'^s (?:until|for) [a-z ]+', 's ', rows[0]['what']).strip()  # 's (median)'
     share = f'{held}/{tried}'
     parts = [share if held == tried else f'**{share}**',
