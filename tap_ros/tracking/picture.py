@@ -9,8 +9,10 @@ import numpy as np
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import View
 
+SQUARE = np.ones((3, 3), np.uint8)  # what a mask is grown or shrunk by
 FEW = 4  # colours of a Palette, at most
 NEAR = 15.4  # distance from a colour of an object below which it has that colour
+CHANGED = 8.0  # distance of colours that differ
 TONE = 0.03  # of the light or of a channel, from which on a change is taken back
 DARK, BRIGHT = 12, 243  # levels between which a change of light shows
 
@@ -56,14 +58,10 @@ class Picture:
     def __init__(self, view: View, plane: Plane, like: 'Picture | None' = None) -> None:
         self.plane, self.size = plane, plane.working
         h, w = self.size
-        image = view.image
-        if image.shape[:2] != self.size:
-            smaller = image.shape[0] > h or image.shape[1] > w
-            image = np.asarray(cv2.resize(
-                image, (w, h), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC))
+        how = cv2.INTER_AREA if view.image.size > 3 * h * w else cv2.INTER_CUBIC
+        image = np.asarray(cv2.resize(view.image, (w, h), interpolation=how))
         mask = np.zeros(self.size, np.uint8) if view.robot_mask is None else view.robot_mask
-        self.hidden = np.asarray(mask if mask.shape == self.size else cv2.resize(
-            mask, (w, h), interpolation=cv2.INTER_NEAREST)) > 0
+        self.hidden = np.asarray(cv2.resize(mask, (w, h), interpolation=cv2.INTER_NEAREST)) > 0
         self.image = image if like is None else self._toned(image, like)
         self._full = cv2.cvtColor(cv2.GaussianBlur(self.image, (3, 3), 0.7), cv2.COLOR_RGB2LAB)
         self._made = {COLOUR: self}
@@ -72,8 +70,7 @@ class Picture:
     def _weigh(self, metric: Metric) -> None:
         self.metric = metric
         self.lab = np.asarray(cv2.LUT(self._full, metric.weighed))
-        L, a, b = (np.asarray(part) for part in cv2.split(cv2.LUT(self._full, metric.index)))
-        self.index: np.ndarray = np.bitwise_or(np.bitwise_or(L, a), b)
+        self.index = np.asarray(cv2.transform(cv2.LUT(self._full, metric.index), np.ones((1, 3))))
 
     def by(self, metric: Metric) -> 'Picture':
         """Return the same picture by another metric."""
@@ -85,9 +82,8 @@ class Picture:
     def _toned(self, image: np.ndarray, like: 'Picture') -> np.ndarray:
         """Return an image in the light of another picture: most of both shows the same."""
         here, there = image[::4, ::4], like.image[::4, ::4]
-        free = ~(self.hidden | like.hidden)[::4, ::4]
-        shown = [free & (part.min(-1) > DARK) & (part.max(-1) < BRIGHT) for part in (here, there)]
-        both = shown[0] & shown[1]
+        both = ~(self.hidden | like.hidden)[::4, ::4] & (
+            np.minimum(here, there).min(-1) > DARK) & (np.maximum(here, there).max(-1) < BRIGHT)
         if both.sum() < 50:
             return image
         gain = np.median(there[both] / here[both], 0)
@@ -96,10 +92,9 @@ class Picture:
         lut = np.rint(np.outer(np.arange(256), gain)).clip(0, 255).astype(np.uint8)[:, None]
         return np.asarray(cv2.LUT(image, lut))
 
-    def apart(self, other: 'Picture') -> np.ndarray:
-        """Return the distance (h, w) float32 of the colours of each pixel."""
-        return np.asarray(cv2.transform(
-            cv2.absdiff(self.lab, other.lab).astype(np.float32), np.ones((1, 3))))
+    def changed(self, other: 'Picture') -> np.ndarray:
+        """Return where (h, w) bool the colours differ."""
+        return np.asarray(cv2.absdiff(self.lab, other.lab)).sum(-1) > CHANGED
 
 
 class Palette:

@@ -1,18 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Between pixels and the table: the plane of the objects' tops, and that of their middles.
-
-Everything in this folder is done in a working picture, whose longer side has SIDE pixels, whatever
-the camera's size is.
-"""
+"""Between pixels and the table: the plane of the objects' tops, and that of their middles."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.base.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
 
-SIDE = 256
+SIDE = 256  # px of the longer side of the working picture, in which all of this folder is done
 TOP, MIDDLE = 0.06, 0.03  # m above the table: what most of a silhouette shows, and its middle
 STEEP = 0.1  # sine of the angle at which a camera looks down on the middle of the table, at least
 EDGE = 0.47  # m, |x| and |y| on a calibrated table
@@ -34,7 +29,7 @@ class Plane:
     """
 
     def __init__(self, camera: PinholeCamera | None, size: tuple[int, int]) -> None:
-        self.size, self.calibrated = size, camera is not None
+        self.calibrated = camera is not None
         height, width = size
         scale = SIDE / max(size)
         self.working = max(round(height * scale), 1), max(round(width * scale), 1)

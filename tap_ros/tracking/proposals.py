@@ -8,21 +8,11 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.tracking.picture import FEW, Palette, Picture
+from tap_ros.tracking.picture import FEW, Palette, Picture, SQUARE
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import View
-from tap_ros.tracking.registration import CHANGED, LEAST_SURE, locate
-from tap_ros.tracking.silhouette import (
-    centre,
-    COMMON,
-    Cut,
-    LEAST_CONTRAST,
-    LIKELY,
-    SHARED,
-    silhouette,
-    top_face,
-)
-from tap_ros.tracking.template import Matcher, Pose, Template
+from tap_ros.tracking.silhouette import centre, COMMON, LEAST_CONTRAST, LIKELY, SHARED, silhouette
+from tap_ros.tracking.template import Matcher, Pose, SURE, Template
 
 LEAST_CHANGED = 60  # px of the working picture
 MOST_TRIED = 32  # changes, the largest ones, where an object may have been
@@ -33,7 +23,6 @@ LEAST_PIECE = 0.15  # share of what was cut out, of an object in it
 NEAR = 0.03  # m, by which the gap of two pieces of one object may change
 SEEMS = 1.4  # factor by which it may seem to, beside that, where the camera is not known
 MOVED = 0.3  # share of a piece in what has changed, without which it stands where it stood
-_SQUARE = np.ones((3, 3), np.uint8)
 
 
 def propose(start: View, goal: View, camera: PinholeCamera | None = None) -> np.ndarray:
@@ -54,9 +43,10 @@ def propose(start: View, goal: View, camera: PinholeCamera | None = None) -> np.
         part = parts.pop(0)
         cut = silhouette(before, _deepest(part))
         if cut.contrast > LEAST_CONTRAST:
-            found += [mask for mask in _apart(before, after, plane, part, cut) if all(
+            masks = _apart(before.by(cut.metric), after.by(cut.metric), part, cut.mask)
+            found += [mask for mask in masks if all(
                 (mask & other).sum() < SHARED * mask.sum() for other in found)]
-            rest = part & ~(cv2.dilate(cut.mask.astype(np.uint8), _SQUARE) > 0)
+            rest = part & ~(cv2.dilate(cut.mask.astype(np.uint8), SQUARE) > 0)
             if rest.sum() < part.sum():  # else the cut missed it, and would again
                 parts = [*_parts(rest), *parts]
     found.sort(key=lambda mask: -int(mask.sum()))
@@ -64,12 +54,8 @@ def propose(start: View, goal: View, camera: PinholeCamera | None = None) -> np.
 
 
 def _changed_objects(before: Picture, after: Picture) -> Iterator[np.ndarray]:
-    """
-    Yield parts (h, w) bool of a picture that have changed, or may have, and are no table.
-
-    What the robot hides in the other picture may have. Colours of the table are those around.
-    """
-    may = ((before.apart(after) > CHANGED) | after.hidden) & ~before.hidden
+    """Yield parts (h, w) bool that changed, or may have behind the robot, and are no table."""
+    may = (before.changed(after) | after.hidden) & ~before.hidden
     for region in _parts(may)[:MOST_TRIED]:
         beside = (cv2.dilate(region.astype(np.uint8), np.ones((15, 15), np.uint8)) > may
                   ) & ~before.hidden
@@ -78,30 +64,24 @@ def _changed_objects(before: Picture, after: Picture) -> Iterator[np.ndarray]:
             yield from _parts(region & (table.distance(before.index) > LIKELY))
 
 
-def _apart(before: Picture, after: Picture, plane: Plane, part: np.ndarray,
-           cut: Cut) -> list[np.ndarray]:
-    """Return the objects (h, w) bool in a cut around a part that has changed."""
-    whole = [cut.mask]
-    (pose,) = _located(before, after, plane, cut, whole)
-    if pose is not None and pose.fit > WHOLE and (
-            np.linalg.norm(pose.place - plane.of_top(centre(cut.mask))) > NEAR):
-        return whole
-    pieces = _pieces(before, cut.mask)
-    groups: list[list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = []
-    for piece, pose in zip(pieces, _located(before, after, plane, cut, pieces)):
-        if pose is None:
-            continue
-        known = piece, plane.of_top(centre(piece)), pose.place
+def _apart(before: Picture, after: Picture, part: np.ndarray,
+           cut: np.ndarray) -> list[np.ndarray]:
+    """Return the objects (h, w) bool in what was cut out around a part that has changed."""
+    for _, pose in _located(before, after, [cut]):
+        if pose.fit > WHOLE and np.linalg.norm(pose.place - pose.template.place) > NEAR:
+            return [cut]
+    groups: list[list[tuple[np.ndarray, Pose]]] = []
+    for piece in _located(before, after, _pieces(before, cut)):
         for group in groups:
-            if all(_kept(known[1] - here, known[2] - there, plane) for _, here, there in group):
-                group.append(known)
+            if all(_kept(piece[1], pose, before.plane) for _, pose in group):
+                group.append(piece)
                 break
         else:
-            groups.append([known])
-    masks = [np.logical_or.reduce([piece for piece, _, _ in group]) for group in groups]
-    masks = [mask for mask in masks if mask.sum() > LEAST_PIECE * cut.mask.sum()]
+            groups.append([piece])
+    masks = [np.logical_or.reduce([mask for mask, _ in group]) for group in groups]
+    masks = [mask for mask in masks if mask.sum() > LEAST_PIECE * cut.sum()]
     moved = [mask for mask in masks if (mask & part).sum() > MOVED * mask.sum()]
-    return moved if len(masks) > 1 and moved else whole
+    return moved if len(masks) > 1 and moved else [cut]
 
 
 def _pieces(picture: Picture, mask: np.ndarray) -> list[np.ndarray]:
@@ -110,7 +90,7 @@ def _pieces(picture: Picture, mask: np.ndarray) -> list[np.ndarray]:
     colours /= colours.sum(1, keepdims=True)
     cv2.setRNGSeed(0)
     _, labels, found = cv2.kmeans(
-        colours, min(FEW, len(colours)), np.zeros((len(colours), 1), np.int32), (3, 15, 1e-3), 2,
+        colours, FEW, np.zeros((len(colours), 1), np.int32), (3, 15, 1e-3), 2,
         cv2.KMEANS_PP_CENTERS)
     centres = np.asarray(found)
     _, kinds = connected_components(np.linalg.norm(centres[:, None] - centres, axis=-1) < SHADE)
@@ -119,28 +99,28 @@ def _pieces(picture: Picture, mask: np.ndarray) -> list[np.ndarray]:
     return [part for kind in np.unique(kinds) for part in _parts(shown == kind)]
 
 
-def _located(before: Picture, after: Picture, plane: Plane, cut: Cut,
-             masks: Sequence[np.ndarray]) -> list[Pose | None]:
-    """Return where each mask of a picture is in another one; None where it is not."""
-    matcher, shown, found = Matcher(after.by(cut.metric)), before.by(cut.metric), []
+def _located(before: Picture, after: Picture,
+             masks: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, Pose]]:
+    """Yield those masks of a picture that are found in another one, and where."""
+    matcher = Matcher(after)
     for mask in masks:
-        place = plane.of_top(centre(mask))
-        template = Template(shown, mask, place, 0.0, top_face(mask, plane))
-        pose = locate(matcher, template, extra=[place])
-        found.append(pose if pose is not None and pose.confidence > LEAST_SURE else None)
-    return found
+        place = before.plane.of_top(centre(mask))
+        pose = matcher.locate(Template(before, mask, place, 0.0, top=True), extra=[place])
+        if pose.confidence > SURE:
+            yield mask, pose
 
 
-def _kept(before: np.ndarray, after: np.ndarray, plane: Plane) -> bool:
+def _kept(one: Pose, other: Pose, plane: Plane) -> bool:
     """Return whether two pieces are as far apart as before; without calibration as it seems."""
-    first, second = float(np.linalg.norm(before)), float(np.linalg.norm(after))
+    before, after = (float(np.linalg.norm(first - second)) for first, second in (
+        (one.template.place, other.template.place), (one.place, other.place)))
     factor = 1.0 if plane.calibrated else SEEMS
-    return first / factor - NEAR < second < first * factor + NEAR
+    return before / factor - NEAR < after < before * factor + NEAR
 
 
 def _parts(mask: np.ndarray) -> list[np.ndarray]:
     """Return the connected parts of a mask (h, w) that are not too small, the largest first."""
-    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _SQUARE)
+    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, SQUARE)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
     areas = stats[:, cv2.CC_STAT_AREA]
     areas[0] = 0

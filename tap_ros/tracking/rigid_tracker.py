@@ -18,9 +18,8 @@ from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
-from tap_ros.tracking.registration import locate, mean_shift, register
 from tap_ros.tracking.silhouette import apart, centre, clicked, Cut, share, silhouette, top_face
-from tap_ros.tracking.template import Matcher, Pose, Template
+from tap_ros.tracking.template import Matcher, Pose, SURE, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
 REST, REST_TURN = 0.012, 0.1  # the same, of what the hand is not near to
@@ -35,6 +34,7 @@ WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
 RECURS = 0.6  # share of the colours of the first template in such a cut
 KEYS = 6  # templates of an object, the first among them
+KEPT = 0.1  # weight of places where a goal picture shows nothing else
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
 MOST = (0.5, 1.8)  # of its area, that has to be there then
 # Confidence in the last place of an object: at once, and the factor of each further picture.
@@ -49,7 +49,7 @@ class _Object:
     place: np.ndarray  # (2,) m
     keys: list[Template]  # the first one, and later ones that show other sides
     face: Template  # of its top alone, which looks alike from all sides
-    shown: Template  # that it was seen by last
+    template: Template  # that it was seen by last
     angle: float = 0.0
     state: str = SEEN
     age: int = 0  # pictures since it was seen
@@ -61,12 +61,28 @@ class _Object:
 
     def nearest(self) -> list[Template]:
         """Return its templates, those first that show it turned like now."""
-        return sorted(self.keys, key=lambda key: _turned(self, key))
+        return sorted(self.keys, key=self.turned)
+
+    def turned(self, key: Template) -> float:
+        """Return by how much it is turned from where a template shows it, rad."""
+        return float(np.abs(np.angle(np.exp(1j * (self.angle - key.angle)))))
+
+    def pushed(self, hand: np.ndarray) -> np.ndarray:
+        """Return how far (2,) m the hand has moved it while nobody saw it."""
+        way = hand[1, :2] - hand[0, :2]
+        length = float(np.linalg.norm(way))
+        if hand[:, 2].max() > TOP or not length:
+            return np.zeros(2)
+        along, aside = way / length, np.array([-way[1], way[0]]) / length
+        points = self.face.placed(self.face.points, self.place, self.angle) - hand[1, :2]
+        met = points[np.abs(points @ aside) < HAND_HALF] @ along
+        met = met[met > -length - HAND_HALF]  # what is behind the hand stays there
+        return along * np.clip(HAND_HALF - met.min(initial=HAND_HALF), 0, length)
 
 
 class RigidTracker:
     """
-    A Tracker, see protocols.
+    A Tracker, see protocols for what its methods do.
 
     :param camera: PinholeCamera of any size, or None.
     :param snap: take the middle of the silhouette for the object's, else the click.
@@ -74,18 +90,9 @@ class RigidTracker:
 
     def __init__(self, camera: PinholeCamera | None = None, snap: bool = True) -> None:
         self._camera, self._snap = camera, snap
-        self._objects: list[_Object] = []
-        self._gripper: np.ndarray | None = None
 
     def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray,
                drawn: Sequence[np.ndarray] = ()) -> Tracked:
-        """
-        Follow these objects from this picture on, in place of those before.
-
-        :param pixels: (K, 2), a click on each object; drawn: K outlines (N, 2), or ().
-        :return: each at the middle of its silhouette.
-        :raises TrackingError: for a click on nothing; then those before are followed on.
-        """
         plane = Plane(self._camera, view.image.shape[:2])
         picture = Picture(view, plane)
         clicks = plane.shrink(np.reshape(pixels, (-1, 2)))
@@ -108,16 +115,14 @@ class RigidTracker:
         """Return what is known of an object that was cut out around a pixel."""
         plane, sure = picture.plane, cut.sure(at)
         # Of half an object, or two witnesses that contradict each other: half way.
-        way, face = 0.0 if not self._snap else 1.0 if sure else 0.5, top_face(cut.mask, plane)
-        place = way * plane.of_top(centre(face)) + (1 - way) * plane.of_middle(at)
-        first, top = (Template(picture.by(cut.metric), cut.mask, place, angle, part)
-                      for part in (None, face))
-        return _Object(place, [first], top, first, angle, sure=sure, part=not cut.whole)
+        way = 0.0 if not self._snap else 1.0 if sure else 0.5
+        middle = plane.of_top(centre(top_face(cut.mask, plane)))
+        place = way * middle + (1 - way) * plane.of_middle(at)
+        first, face = (Template(picture.by(cut.metric), cut.mask, place, angle, top)
+                       for top in (False, True))
+        return _Object(place, [first], face, first, angle, sure=sure, part=not cut.whole)
 
     def update(self, view: View) -> Tracked:
-        """Return where the K objects are in the next picture."""
-        if not self._objects:
-            return self._tracked()
         picture = Picture(view, self._plane, self._first)
         hand = None if view.gripper is None or self._gripper is None else (
             np.stack([self._gripper, view.gripper])[:, :3])
@@ -127,9 +132,25 @@ class RigidTracker:
         return self._tracked()
 
     def find(self, view: View) -> Tracked:
-        """Return where they are in another picture, such as that of a goal; LOST: nowhere."""
-        return register(self._first, Picture(view, self._plane, self._first),
-                        [one.face for one in self._objects])
+        picture, found = Picture(view, self._plane, self._first), dict[int, Pose]()
+        changed = self._first.changed(picture).astype(np.float32)
+        region = KEPT + cv2.GaussianBlur(changed, (0, 0), 4)
+        faces = [one.face for one in self._objects]
+        matchers = {face.metric: Matcher(picture.by(face.metric)) for face in faces}
+        for _ in faces:  # the one that fits best first
+            avoid = [pose.place for pose in found.values()]
+            tried = {k: matchers[face.metric].locate(face, avoid, region, [face.place])
+                     for k, face in enumerate(faces) if k not in found}
+            best = min(tried, key=lambda k: tried[k].cost)
+            found[best] = tried[best]
+        poses, plane = [found[k] for k in range(len(faces))], self._plane
+        confidence = np.array([pose.confidence for pose in poses])
+        pixels = np.array([plane.enlarge(plane.middle_pixels(pose.place)) if sure else (
+            np.nan, np.nan) for pose, sure in zip(poses, confidence > SURE)]).reshape(-1, 2)
+        return Tracked(
+            pixels, tuple(SEEN if sure else LOST for sure in confidence > SURE), confidence,
+            tuple(plane.enlarge(self._outline(pose)) if sure else np.zeros((0, 2))
+                  for pose, sure in zip(poses, confidence > SURE)))
 
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
@@ -138,17 +159,16 @@ class RigidTracker:
             return
         one.searched, one.waits = None, one.waits - 1
         if one.age and hand is not None:
-            one.place = one.place + _pushed(one, hand)
+            one.place = one.place + one.pushed(hand)
         matcher = Matcher(picture, self._covered(one, picture))
         pose = self._search(one, matcher, hand)
-        if pose is not None and pose.fit > GOOD:
-            one.place, one.angle, one.shown = pose.place, pose.angle, pose.template
+        if pose.fit > GOOD:
+            one.place, one.angle, one.template = pose.place, pose.angle, pose.template
             one.age, one.confidence = 0, pose.confidence
             one.state = (SEEN if pose.sure else HIDDEN if pose.seen < 0.5 else UNSURE)
             one.searched = picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
-                    one.part or pose.cost > NEW_COST
-                    or _turned(one, one.nearest()[0]) > NEW_ANGLE):
+                    one.part or pose.cost > NEW_COST or one.turned(one.nearest()[0]) > NEW_ANGLE):
                 self._cut_anew(one, picture)
             return
         key = one.nearest()[0]
@@ -156,13 +176,13 @@ class RigidTracker:
         one.age += 1
         one.state = HIDDEN if seen[0] < 0.5 else UNSURE if one.age <= PATIENCE else LOST
         if one.state != HIDDEN and key.contrast > COLOURFUL:
-            place, amount = mean_shift(matcher, key, one.place)
+            place, amount = matcher.mean_shift(key, one.place)
             if MOST[0] < amount < MOST[1]:  # lifted, or turned to a side not seen before
                 one.place, one.state = place, UNSURE
         first, fall = DOUBT[one.state]
         one.confidence = first * fall ** (one.age - 1)
 
-    def _search(self, one: _Object, matcher: Matcher, hand: np.ndarray | None) -> Pose | None:
+    def _search(self, one: _Object, matcher: Matcher, hand: np.ndarray | None) -> Pose:
         """Return the best pose near by, else anywhere."""
         grown = 1 + 0.5 * min(one.age, 4)
         reach, turn, push = REACH * grown, TURN * min(grown, 2), np.zeros(2)
@@ -175,21 +195,20 @@ class RigidTracker:
                 reach, turn = REST, REST_TURN
         keys = one.nearest()
         best = matcher.refine(keys[0], one.place, one.angle, reach, turn)
-        if best is not None and best.fit > GOOD and best.cost < GOOD_COST:
+        if best.fit > GOOD and best.cost < GOOD_COST:
             return best
         others = [(key, one.place) for key in (*keys[1:2], one.face)]
         if np.linalg.norm(push) > 0.01:
             others.append((keys[0], one.place + push))
         for key, place in others:
             pose = matcher.refine(key, place, one.angle, reach, turn)
-            if pose is not None and (best is None or pose.cost < best.cost - 0.03):
+            if pose.cost < best.cost - 0.03:
                 best = pose
-        if one.age >= 1 and not (best is not None and best.fit > GOOD):
+        if one.age and best.fit <= GOOD:
             avoid = [other.place for other in self._objects if other is not one]
-            pose = locate(matcher, one.face, avoid)
-            if (pose is not None and pose.fit > GOOD and pose.cost < MOST_COST
-                    and np.linalg.norm(pose.place - one.place) < 0.08 * (one.age + 1) + 0.03
-                    and (best is None or pose.cost < best.cost - 0.1)):
+            pose = matcher.locate(one.face, avoid)
+            if (pose.fit > GOOD and pose.cost < min(MOST_COST, best.cost - 0.1)
+                    and np.linalg.norm(pose.place - one.place) < 0.08 * (one.age + 1) + 0.03):
                 return pose
         return best
 
@@ -240,29 +259,11 @@ class RigidTracker:
         """Return where the objects are."""
         places = np.array([one.place for one in self._objects]).reshape(-1, 2)
         return Tracked(
-            self._plane.enlarge(self._plane.middle_pixels(places)) if self._objects else places,
+            self._plane.enlarge(self._plane.middle_pixels(places)),
             tuple(one.state for one in self._objects),
             np.array([one.confidence * (1.0 if one.sure else UNSURELY) for one in self._objects]),
             tuple(self._plane.enlarge(self._outline(one)) for one in self._objects))
 
-    def _outline(self, one: _Object) -> np.ndarray:
+    def _outline(self, one: _Object | Pose) -> np.ndarray:
         return self._plane.top_pixels(
-            one.shown.placed(one.shown.outline, one.place, one.angle))
-
-
-def _pushed(one: _Object, hand: np.ndarray) -> np.ndarray:
-    """Return how far (2,) m the hand has moved an object that nobody saw meanwhile."""
-    way = hand[1, :2] - hand[0, :2]
-    length = float(np.linalg.norm(way))
-    if hand[:, 2].max() > TOP or not length:
-        return np.zeros(2)
-    along, aside = way / length, np.array([-way[1], way[0]]) / length
-    points = one.face.placed(one.face.points, one.place, one.angle) - hand[1, :2]
-    met = points[np.abs(points @ aside) < HAND_HALF] @ along
-    met = met[met > -length - HAND_HALF]  # what is behind the hand stays there
-    return along * np.clip(HAND_HALF - met.min(initial=HAND_HALF), 0, length)
-
-
-def _turned(one: _Object, key: Template) -> float:
-    """Return by how much an object is turned from where a template shows it, rad."""
-    return float(np.abs(np.angle(np.exp(1j * (one.angle - key.angle)))))
+            one.template.placed(one.template.outline, one.place, one.angle))

@@ -9,7 +9,7 @@ from itertools import combinations
 import cv2
 import numpy as np
 from tap_ros.base.errors import TrackingError
-from tap_ros.tracking.picture import COLOUR, LIGHT, Metric, Palette, Picture
+from tap_ros.tracking.picture import COLOUR, LIGHT, Metric, Palette, Picture, SQUARE
 from tap_ros.tracking.plane import Plane
 
 RADII = 36, 64  # working pixels from a click to where no object reaches; a large one
@@ -56,8 +56,7 @@ def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | 
     """
     Cut out the object around a pixel.
 
-    :param at: (2,) (u, v) in the working picture.
-    :param others: pixels of other objects.
+    :param at: (2,) (u, v) in the working picture; others: of other objects.
     :param radius: px, up to which it is searched; 0: as far as it reaches, see RADII.
     """
     if radius:
@@ -70,8 +69,8 @@ def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | 
             cut = large
     if cut.off(at) > NEARER:  # another one may touch it
         alone = _cut(picture, at, others, near, alone=True)
-        if alone.off(at) < cut.off(at) - NEARER and (
-                cut.contrast < SURE and alone.contrast > CLEARER * cut.contrast):
+        if (alone.off(at) < cut.off(at) - NEARER and cut.contrast < SURE
+                and alone.contrast > CLEARER * cut.contrast):
             cut = replace(alone, touched=True)
     return cut
 
@@ -91,80 +90,66 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     far = np.hypot(x - u, y - v)
     gaps = [np.hypot(x - other[0], y - other[1]) for other in others]  # from those
     hidden = picture.hidden[window]
-    inner, outer = radius * _RINGS[0], radius * _RINGS[1]
-    ring = (far > inner) & (far < outer)
+    ring = (far > radius * _RINGS[0]) & (far < radius * _RINGS[1])
     for clear in (~hidden, *(gap > radius * 0.6 for gap in gaps)):
         if (ring & clear).sum() > 50:
             ring &= clear
-    empty = np.zeros(picture.size, bool)
-    nothing = Cut(empty, 0.0, COLOUR, False)
-    if not ring.any():
-        return nothing
     image = picture.image[window]
-    hue = np.min([Palette(shaded(image[ring][:, None], light), least=COMMON).distance(
-        picture.index[window]) for light in SHADES], 0)
+    shades = [cv2.cvtColor(np.rint(image[ring][:, None] * light).astype(np.uint8),
+                           cv2.COLOR_RGB2LAB) for light in SHADES]
+    hue = np.min([Palette(np.asarray(cv2.LUT(shade, COLOUR.weighed))[:, 0], least=COMMON).distance(
+        picture.index[window]) for shade in shades], 0)
     light = picture.by(LIGHT).lab[window][..., 0].astype(np.float32)
     dark, bright = np.percentile(light[ring], (100 - LIGHTEST, LIGHTEST))
     unlike = hue + np.maximum(light - bright, 0) + np.maximum(dark * SHADES[-1] - light, 0)
-    mask = np.full(far.shape, cv2.GC_BGD, np.uint8)
     near, core = far < radius, far < CORE
-    mask[near] = cv2.GC_PR_BGD
-    likely, possible = near & (unlike > LIKELY), (far < radius / 3) & (unlike > POSSIBLE)
+    mask = np.where(near, cv2.GC_PR_BGD, cv2.GC_BGD).astype(np.uint8)
+    likely = near & (unlike > LIKELY) | (far < radius / 3) & (unlike > POSSIBLE)
     sure = np.logical_and.reduce([near, unlike > SURE, *(far < gap for gap in gaps)])
     if alone:
         shown = picture.by(LIGHT)
         own = Palette(shown.lab[window][core & ~hidden], LIGHT).distance(
             shown.index[window]) < ALIKE if (core & ~hidden).any() else core
-        likely, possible, sure = likely & own, possible & own, sure & own
+        likely, sure = likely & own, sure & own
         mask[(unlike > SURE) & ~own] = cv2.GC_BGD
-    mask[likely | possible] = cv2.GC_PR_FGD
+    mask[likely] = cv2.GC_PR_FGD
     _, parts = cv2.connectedComponents((sure | core).astype(np.uint8))
-    mask[sure & np.isin(parts, parts[core])] = cv2.GC_FGD
-    mask[core] = cv2.GC_FGD
+    mask[core | sure & np.isin(parts, parts[core])] = cv2.GC_FGD
     mask[hidden] = cv2.GC_BGD
     for other, gap in zip(others, gaps):
         if np.hypot(other[0] - u, other[1] - v) > 2 * CORE:
             mask[gap < CORE] = cv2.GC_BGD
-    if not (mask & 1).any():
-        return nothing
-    cv2.setRNGSeed(0)
-    cv2.grabCut(np.ascontiguousarray(image), mask, (0, 0, 0, 0), np.zeros((1, 65)),
-                np.zeros((1, 65)), 3, cv2.GC_INIT_WITH_MASK)
-    found = cv2.morphologyEx(mask & 1, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    count, labels = cv2.connectedComponents(found)
-    if count > 2:
-        inside = labels[(far < 2 * CORE) & (found > 0)]
-        part = np.bincount(inside).argmax() if len(inside) else labels.flat[
-            np.where(found > 0, far, np.inf).argmin()]
-        found = labels == part
-    empty[window] = found
-    if not empty.any():
-        return nothing
-    contrast, colour = (float(np.median(one[found > 0])) for one in (unlike, hue))
+    if (mask & 1).any():
+        cv2.setRNGSeed(0)
+        cv2.grabCut(np.ascontiguousarray(image), mask, (0, 0, 0, 0), np.zeros((1, 65)),
+                    np.zeros((1, 65)), 3, cv2.GC_INIT_WITH_MASK)
+    whole = np.zeros(picture.size, bool)
+    _, parts = cv2.connectedComponents(cv2.morphologyEx(mask & 1, cv2.MORPH_OPEN, SQUARE))
+    if not parts.any():
+        return Cut(whole, 0.0, COLOUR, False)
+    inside = parts[(far < 2 * CORE) & (parts > 0)]
+    part = parts == (np.bincount(inside).argmax() if len(inside) else parts.flat[
+        np.where(parts > 0, far, np.inf).argmin()])
+    whole[window] = part
+    contrast, colour = (float(np.median(one[part])) for one in (unlike, hue))
     believed = contrast > SPREAD * np.median(unlike[ring])
-    return Cut(empty, contrast if believed else 0.0, COLOUR if colour > COLOURFUL else LIGHT,
-               share(empty, picture.hidden | _beyond(picture, at, radius - 2)) <= TOUCHING)
+    return Cut(whole, contrast if believed else 0.0, COLOUR if colour > COLOURFUL else LIGHT,
+               share(whole, picture.hidden | _beyond(picture, at, radius - 2)) <= TOUCHING)
 
 
 def _beyond(picture: Picture, at: np.ndarray, radius: float) -> np.ndarray:
     """Return the pixels (h, w) farther from one than a radius, and those at the edge."""
-    h, w = picture.size
-    y, x = np.ogrid[:h, :w]
-    edge = (x < 1) | (y < 1) | (x > w - 2) | (y > h - 2)
-    return np.asarray((np.hypot(x - at[0], y - at[1]) > radius) | edge)
+    y, x = np.ogrid[:picture.size[0], :picture.size[1]]
+    beyond = np.asarray(np.hypot(x - at[0], y - at[1]) > radius)
+    beyond[[0, -1]] = beyond[:, [0, -1]] = True
+    return beyond
 
 
 def share(mask: np.ndarray, ends: np.ndarray) -> float:
     """Return the share of the rim of a mask that is next to other pixels, both (h, w) bool."""
-    rim = (cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~cv2.erode(
-        mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    shown = mask.astype(np.uint8)
+    rim = cv2.dilate(shown, np.ones((5, 5), np.uint8)) > cv2.erode(shown, SQUARE)
     return float(ends[rim].mean()) if rim.any() else 0.0
-
-
-def shaded(colours: np.ndarray, share: float) -> np.ndarray:
-    """Return colours (N, 1, 3) uint8 rgb with a share of their light, (N, 3) as Picture.lab."""
-    lab = cv2.cvtColor(np.rint(colours * share).astype(np.uint8), cv2.COLOR_RGB2LAB)
-    return np.asarray(cv2.LUT(lab, COLOUR.weighed))[:, 0]
 
 
 def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
@@ -176,8 +161,7 @@ def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
     :param line: (N, 2) outline of the object, where it is known.
     :raises TrackingError: for a click outside the picture, on the robot, or on nothing.
     """
-    h, w = picture.size
-    if not (np.isfinite(at).all() and -0.5 <= at[0] < w - 0.5 and -0.5 <= at[1] < h - 0.5):
+    if not ((at >= -0.5) & (at < np.array(picture.size[::-1]) - 0.5)).all():
         raise TrackingError(f'{name} is outside the picture; click on an object')
     if picture.hidden[round(float(at[1])), round(float(at[0]))]:
         raise TrackingError(f'{name} is on the robot or its shadow; click on an object, or move '
@@ -202,7 +186,7 @@ def apart(picture: Picture, clicks: np.ndarray, cuts: Sequence[Cut]) -> list[Cut
         shared = pair[0] & pair[1]
         if shared.sum() <= SHARED * min(mask.sum() for mask in pair):
             continue
-        under = [_cut(picture, clicks[k], np.delete(clicks, k, 0), RADII[0], alone=True).mask
+        under = [_cut(picture, clicks[k], np.delete(clicks, k, 0), RADII[0], True).mask
                  for k in (i, j)]
         own = [mask & ~shared | alone & ~other for mask, alone, other in zip(
             pair, under, under[::-1])]
@@ -214,13 +198,6 @@ def apart(picture: Picture, clicks: np.ndarray, cuts: Sequence[Cut]) -> list[Cut
     return found
 
 
-def outline(mask: np.ndarray) -> np.ndarray:
-    """Return the outer outline (N, 2) of a mask (h, w) in pixels."""
-    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL,
-                                cv2.CHAIN_APPROX_TC89_L1)
-    return max(found, key=len)[:, 0].astype(np.float64) if found else np.zeros((0, 2))
-
-
 def top_face(mask: np.ndarray, plane: Plane) -> np.ndarray:
     """
     Return the part of a silhouette (h, w) that is the top of an upright object.
@@ -228,13 +205,11 @@ def top_face(mask: np.ndarray, plane: Plane) -> np.ndarray:
     Beneath a pixel of the top the whole side is in the silhouette, too. What is too flat for that
     is all top.
     """
-    top = mask.copy()
-    rise = plane.rise(plane.of_top(centre(mask)))
-    v, u = np.nonzero(mask)
+    top, at = mask.copy(), np.argwhere(mask)
+    rise = plane.rise(plane.of_top(centre(mask)))[::-1]
     for share in np.linspace(0, 1, 9)[1:]:
-        below = np.rint(np.column_stack([u, v]) - share * rise).astype(int)
-        below = below.clip(0, np.array(mask.shape[::-1]) - 1)
-        top[v, u] &= mask[below[:, 1], below[:, 0]]
+        below = np.rint(at - share * rise).astype(int).clip(0, np.array(mask.shape) - 1)
+        top[mask] &= mask[tuple(below.T)]
     return top if top.sum() > FLAT * mask.sum() else mask
 
 

@@ -1,25 +1,34 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A rigid template of an object on the plane of the tops, compared at many poses."""
+"""A rigid template of an object on the plane of the tops, searched in pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from tap_ros.tracking.picture import NEAR, Palette, Picture
-from tap_ros.tracking.silhouette import outline
+from tap_ros.tracking.plane import EDGE
+from tap_ros.tracking.silhouette import top_face
 
 POINTS, RING = 120, 40  # of a template, inside and around
 FAR = 22  # distance of colours that counts as none
 HIDDEN = 0.4  # cost of a point behind the robot: hiding there is no way out
 AROUND = 0.35  # weight of points beside the object that look like it
 SAME = 17.6  # distance below which a point has its own colour
-SURE, SHOWN = 0.9, 0.3  # of a pose, from which on it is sure
+SURE, SHOWN = 0.9, 0.3  # confidence in a pose and share seen, from which on it is sure
 MERGED = 0.4  # more of the points around have its colours than did: it is not told from those
 LEAST_SEEN = 0.2  # share of an object without which no pose near by is believed
 LEAST_SAME = 0.3  # share of points with their own colour without which nothing fits
 CONTRAST = 8.0  # of object and table, below which the surrounding says nothing
 ROUND = 0.06  # cost at the edge of the search: of two places alike the nearer one is meant
+# Anywhere in a picture: places that have the colours of an object, then poses.
+LEAST_FAR = 0.3  # share of an object that has to be seen
+PLACES, TRIED = 6, 4  # that are tried, and turns at each of them that are tried finely
+APART = 0.035  # m from other objects
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.5)
+_TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
+_AROUND = np.stack(np.meshgrid(*[np.linspace(-0.03, 0.03, 5)] * 2), -1).reshape(-1, 2)  # m
 # Of a pose's fit, cost and seen: logistic regression on 11,000 poses in simulated scenes, others
 # than those of docs/results/tracking.md.
 _BIAS, _FIT, _COST, _SEEN = 1.74, 3.25, 7.59, 2.55
@@ -32,20 +41,22 @@ class Template:
     :param mask: (h, w) bool of Picture, the object.
     :param place: (2,) of the object; points are relative to it.
     :param angle: of the object in this picture, relative to the first one, rad.
-    :param face: (h, w) bool, its top, if that alone is compared.
+    :param top: compare its top alone.
     :ivar area: px.
     :ivar metric: Metric of the colours.
     :ivar outline: (N, 2) m around the place.
     """
 
     def __init__(self, picture: Picture, mask: np.ndarray, place: np.ndarray,
-                 angle: float, face: np.ndarray | None = None) -> None:
+                 angle: float, top: bool = False) -> None:
         plane, rng = picture.plane, np.random.default_rng(0)
-        part = mask if face is None else face
+        part = top_face(mask, plane) if top else mask
         self.place, self.angle, self.area = place, angle, int(mask.sum())
         self.metric = picture.metric
         self.palette = Palette(picture.lab[mask], self.metric)
-        self.outline = plane.of_top(outline(mask)) - place
+        outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL,
+                                       cv2.CHAIN_APPROX_TC89_L1)
+        self.outline = plane.of_top(max(outlines, key=len)[:, 0]) - place
         if plane.blur:  # pixels at its edge are mixed with the table
             inside = cv2.erode(part.astype(np.uint8), _round(2 * plane.blur + 1)) > 0
             part = inside if inside.sum() > 0.3 * part.sum() else part
@@ -60,7 +71,7 @@ class Template:
         self.contrast = float(np.median(near)) if len(near) else 0.0
         self.beside = float((near < NEAR).mean()) if len(near) else 0.0
         self.normals: np.ndarray | None = None
-        if plane.calibrated and face is not None:  # sides of the object are beside it
+        if plane.calibrated and top:  # sides of the object are beside it
             smooth = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 3)
             slope = -np.stack(np.gradient(smooth)[::-1], -1)[beside[:, 1], beside[:, 0]]
             normals = plane.of_top(beside + slope) - plane.of_top(beside)
@@ -81,7 +92,7 @@ class Pose:
 
     place: np.ndarray  # (2,) m
     angle: float  # rad
-    cost: float  # 0 to 1.35
+    cost: float  # 0 to 1.35; inf: it was not found
     seen: float  # share of the points that the robot does not hide
     fit: float  # share of those that have colours of the object
     alone: bool  # what is around does not look like the object, too
@@ -167,10 +178,8 @@ class Matcher:
         words, own = self._words.take(index), template.colours[::thin].ravel()
         read = words.view(np.uint8).reshape(-1, len(own))
         apart = np.asarray(cv2.absdiff(read, np.tile(own, (len(read), 1))))
-        # the sum of the four bytes of each word
-        sums = apart.view(np.uint32).reshape(index.shape)
-        sums = (sums & 0xFF00FF) + ((sums >> 8) & 0xFF00FF)
-        return (sums & 0xFFFF) + (sums >> 16), words >= 0
+        sums = apart.reshape(-1, 4).astype(np.float32) @ np.ones(4, np.float32)
+        return sums.reshape(index.shape), words >= 0
 
     def _like(self, template: Template, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how like the object's colours pixels are, 0 where covered; and which are seen."""
@@ -190,14 +199,14 @@ class Matcher:
         return np.where((u < 0) | (u >= w) | (v < 0) | (v >= h), h * w, v * w + u)
 
     def refine(self, template: Template, place: np.ndarray, angle: float, reach: float,
-               turn: float, pull: float = ROUND) -> Pose | None:
+               turn: float, pull: float = ROUND) -> Pose:
         """
         Search around a pose, coarsely and then finely.
 
         :param angle: of the object, relative to the first picture.
         :param reach: m and turn: rad, how far at first.
         :param pull: cost of being reach away.
-        :return: the best Pose, its angle relative to the first picture; or None.
+        :return: the best Pose, its angle relative to the first picture; its cost may be inf.
         """
         best, turned, wide = place, angle - template.angle, reach
         for line, turns, thin, next_reach, next_turn in _LEVELS:
@@ -207,11 +216,64 @@ class Matcher:
             total[seen < LEAST_SEEN] = np.inf
             i, j = np.unravel_index(total.argmin(), total.shape)
             if not np.isfinite(total[i, j]):
-                return None
+                return _nowhere(template)
             best, turned = places[j], float(angles[i])
             reach, turn = reach * next_reach, turn * next_turn
         return Pose(best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
                     *self.fit(template, best, turned), template)
+
+    def locate(self, template: Template, avoid: Sequence[np.ndarray] = (),
+               region: np.ndarray | float = 1.0, extra: Sequence[np.ndarray] = ()) -> Pose:
+        """
+        Search all of the picture for an object, turned by any angle.
+
+        :param avoid: places of other objects.
+        :param region: (h, w) weights of places.
+        :param extra: places that are tried, too.
+        """
+        plane, side = self.picture.plane, max(5.0, template.area ** 0.5)
+        dense = cv2.GaussianBlur(self.likeness(template), (0, 0), side / 2.5) * region
+        peaks = []
+        for _ in range(PLACES):
+            v, u = np.unravel_index(dense.argmax(), dense.shape)
+            if dense[v, u] <= 0.01:
+                break
+            peaks.append(plane.of_top((u, v)))
+            cv2.circle(dense, (int(u), int(v)), int(side * 0.7), 0, -1)
+        best = _nowhere(template)
+        for place in (*peaks, *extra):
+            if (plane.calibrated and (np.abs(place) > EDGE).any()
+                    or any(np.linalg.norm(place - other) < APART for other in avoid)):
+                continue
+            places = place + _AROUND
+            cost, seen = self.score(template, places, _TURNS, thin=3)
+            cost[seen < LEAST_FAR] = np.inf
+            for i in cost.min(1).argsort()[:TRIED]:
+                found = self.refine(template, places[cost[i].argmin()],
+                                    float(_TURNS[i]) + template.angle, 0.02, 0.3, pull=0)
+                if found.cost < best.cost:
+                    best = found
+        return best
+
+    def mean_shift(self, template: Template, place: np.ndarray) -> tuple[np.ndarray, float]:
+        """
+        Follow the colours of an object from a place: coarse, but minds neither height nor sides.
+
+        :return: (2,) the place where they are densest near by; and how much of them is there, as
+            a share of the object's own area.
+        """
+        like, plane = self.likeness(template), self.picture.plane
+        h, w = like.shape
+        half = min(max(6, round(template.area ** 0.5 * 0.6)), h // 2, w // 2)
+        u, v = (plane.top_pixels(place) - half).clip(0, (w - 2 * half, h - 2 * half)).astype(int)
+        _, (u, v, width, height) = cv2.meanShift(
+            (255 * like).astype(np.uint8), (u, v, 2 * half, 2 * half), _STOP)
+        amount = float(like[v:v + height, u:u + width].sum()) / template.area
+        return plane.of_top((u + half, v + half)), amount
+
+
+def _nowhere(template: Template) -> Pose:
+    return Pose(np.full(2, np.nan), 0.0, np.inf, 0.0, 0.0, False, template)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
