@@ -237,9 +237,11 @@ def page(rows):
     for kind, lines in tables.items():
         lines['found'] = {'task': '**found**', FRAMES: ''} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
-    lines = {kind: pd.DataFrame(list(lines.values())).drop(columns='middle', errors='ignore')
-             for kind, lines in tables.items()}
+    lines = {kind: pd.DataFrame(list(lines.values())).drop(
+        columns=['middle', 'random'], errors='ignore') for kind, lines in tables.items()}
+    chances = [row['near']['value'] for row in rows if row['method'] == 'random']
     return render('worlds/templates/worlds.md.j2', marked=MARKED, cuts=CUTS, found=found,
+                  chances=[f'{100 * each(chances):.0f}' for each in (min, max)],
                   more=compare(rows) if found['aside'] else {}, **lines)
 
 
