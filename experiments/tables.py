@@ -6,8 +6,8 @@ The numbers of docs/results, from the data beside the pages.
     python -m experiments.tables
 
 A page has its sentences from a person, and its numbers between two marks from here: lists, on
-docs/speed.md a table. Numbers have their 95% intervals in brackets. A number is missed unless it
-is at least the paper's; where there is none, unless the interval is.
+docs/speed.md a table. Numbers have their 95% intervals in brackets. A number is missed if it is
+worse than the paper's; where there is none, unless its whole interval is above 0, or `fix`.
 """
 
 from dataclasses import fields
@@ -138,8 +138,8 @@ class Tables:
         def points(row):
             return number(row, 100, 0, '', '+')
 
-        yield ('Directly, via the subgoal, and the difference in points (aim: all of its interval '
-               'better):\n')
+        yield ('Directly, via the subgoal, and the difference, points or cm (aim: its whole '
+               'interval better):\n')
         for task, title in (('push2', 'two'), ('push3', 'three')):
             paper = [TABLE_2[task, method][0] for method in ('direct', 'genmin')]
             less = final(task, 'shipped', 'final_distance_difference_cm', compares='direct')
@@ -236,7 +236,7 @@ def machines():
     for row in measured_speed()['rows']:
         if row['aim']:
             found.setdefault(row['machine'], {})[f'{row["commit"]} of {row["date"]}'] = None
-    return {machine: ', '.join(each) for machine, each in found.items()}
+    return {machine: ', '.join(found[machine]) for machine in sorted(found)}
 
 
 def page_path(name):

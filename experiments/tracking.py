@@ -182,7 +182,7 @@ def loop(folder):
         left = (f"{said(task, 'final_distance_cm', method)['value']:.1f}" for method in METHODS)
         lines.append({'': task, 'true pixels': true, 'tracked': mine, 'scenes': gap.n,
                       'difference': number(gap, 100, 0, ' points', '+'),
-                      'cm left, true and tracked': ', '.join(left)})
+                      'distance left, cm: true, tracked': ', '.join(left)})
         tracked[task] = json.loads(Path(
             folder, 'planning', f'{task}-{METHODS[1].replace(":", "--")}.json').read_text())[
                 'scenes']

@@ -78,9 +78,10 @@ def change(name, found, is_all):
     """Put what was found of a part so far into the data, and the page's table made of them."""
     data, machine = tables.measured_speed(), made_by()['machine']
     parts = {part: [row for row in data['rows'] if row['part'] == part] for part in PARTS}
-    new = {row['what'] for row in found}
-    parts[name] = [row for row in parts[name] if row['machine'] != machine or not (
-        is_all or row['what'] in new)] + found
+    new = {row['what']: row for row in found}
+    kept = [row if row['machine'] != machine else new.pop(row['what'], None if is_all else row)
+            for row in parts[name]]
+    parts[name] = [row for row in kept if row] + list(new.values())
     data['rows'] = sum(parts.values(), [])
     unfinished = [name, machine]
     data['unfinished'] = [one for one in data['unfinished'] if one != unfinished] + [

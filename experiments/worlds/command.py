@@ -237,9 +237,12 @@ def page(rows):
     for kind, lines in tables.items():
         lines['found'] = {'task': '**found**', FRAMES: ''} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
-    return render('worlds/templates/worlds.md.j2', marked=MARKED, more=compare(rows), found=found,
-                  **{kind: pd.DataFrame(list(lines.values())).drop(
-                      columns='middle', errors='ignore') for kind, lines in tables.items()})
+    lines = {kind: pd.DataFrame(list(lines.values())).drop(
+        columns=['middle', 'random'], errors='ignore') for kind, lines in tables.items()}
+    chances = [row['near']['value'] for row in rows if row['method'] == 'random']
+    return render('worlds/templates/worlds.md.j2', marked=MARKED, cuts=CUTS, found=found,
+                  chances=[f'{100 * each(chances):.0f}' for each in (min, max)],
+                  more=compare(rows) if found['aside'] else {}, **lines)
 
 
 def compare(rows):
@@ -247,19 +250,19 @@ def compare(rows):
     Compare three pictures with two, over the tasks with several trainings of both.
 
     :return: dict: tasks, how many; hit and near, in words the mean difference in points with its
-        interval over the tasks, whose demonstrations and marks both had; alone, those of the
-        tasks that differ by themselves. There intervals are by Newcombe's square-and-add, as if
-        the two had not seen the same demonstrations.
+        interval over the tasks, whose demonstrations and marks both had; alone, by hit and near
+        those of the tasks that differ by themselves. There intervals are by Newcombe's
+        square-and-add, as if the two had not seen the same demonstrations.
     """
     two, three = ({row['task']: row for row in rows
                    if row['method'] == method and row.get('seeds', 0) > 1}
                   for method in WITH_MARKS)
     tasks = [task for task in three if task in two]
-    found, alone = {'tasks': len(tasks)}, []
+    found, alone = {'tasks': len(tasks)}, {}
     for name in ('hit', 'near'):
         gains = [_less(three[task][name], two[task][name]) for task in tasks]
         found[name] = _in_points(mean_interval([gain.value for gain in gains]))
-        alone += [f'{task.rpartition("/")[2]} {_in_points(gain)}'
+        alone[name] = [f'{task.rpartition("/")[2]} {_in_points(gain)}'
                   for task, gain in zip(tasks, gains) if gain.low > 0 or gain.high < 0]
     return found | {'alone': alone}
 

@@ -90,7 +90,7 @@ def _pieces(picture: Picture, mask: np.ndarray) -> list[np.ndarray]:
     colours /= colours.sum(1, keepdims=True)
     cv2.setRNGSeed(0)
     _, labels, found = cv2.kmeans(
-        colours, FEW, np.zeros((len(colours), 1), np.int32), (3, 15, 1e-3), 2,
+        colours, min(FEW, len(colours)), np.zeros((len(colours), 1), np.int32), (3, 15, 1e-3), 2,
         cv2.KMEANS_PP_CENTERS)
     centres = np.asarray(found)
     _, kinds = connected_components(np.linalg.norm(centres[:, None] - centres, axis=-1) < SHADE)

@@ -54,7 +54,7 @@ class Tracker(Protocol):
         """
 
     def update(self, view: View) -> Tracked:
-        """Return where they are in the next picture."""
+        """Return where they are in the next picture; select comes first."""
 
     def find(self, view: View) -> Tracked:
         """

@@ -68,7 +68,16 @@ def test_three_pictures_are_compared_with_two_over_tasks_of_several_trainings():
             row('a/alone', 'marks', 0.1, 1), row('a/alone', 'three pictures', 0.9, 1)]
     found = command.compare(rows)
     assert found['tasks'] == 2 and found['hit'] == found['near'] == '+5 (-10 to +20)'
-    assert found['alone'] == ['one +20 (+6 to +34)'] * 2
+    assert found['alone'] == dict.fromkeys(('hit', 'near'), ['one +20 (+6 to +34)'])
+
+
+def test_some_tasks_alone_have_a_page():
+    share = {'value': 0.5, 'low': 0.4, 'high': 0.6}
+    page = command.page([
+        {'task': 'ogbench/cube', 'method': method, 'hit': share, 'near': share, 'n': 40,
+         'frames': 37.0, 'bottleneck_frames': 4.0} for method in ('random', 'middle', 'slowest')])
+    assert '| ogbench cube | 37, 4.0 | 50%, 50% |' in page and 'Kept aside' not in page
+    assert 'in 50% to 50%' in page
 
 
 @pytest.mark.parametrize('task', ['drawer', 'cube-double', 'puzzle'])

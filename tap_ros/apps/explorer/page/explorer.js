@@ -99,7 +99,7 @@ function progress() {
       : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
       ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
-      : count && missing.length ? `drag ${missing.join(' and ')} to ${missing.length > 1 ? 'their goals' : 'its goal'}` : goal.pictured ? 'the picture is there' : 'placed by hand',
+      : count && missing.length ? `drag to ${missing.length > 1 ? 'their goals' : 'its goal'}: ${missing.join(', ')}` : goal.pictured ? 'the picture is there' : 'placed by hand',
     camera_why],
     predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : predict_why || 'can be predicted now', predict_why],
     go: [run.reached, run.running ? run.stage : run.end || go_why || 'the arm can go now', go_why]};
