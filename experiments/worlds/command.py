@@ -52,7 +52,6 @@ ASIDE = {**{f'metaworld/{task}-v3': 0 for task in (
     'ogbench/puzzle': 0}
 IMAGE_SIZE = 128  # px, as recorded
 FOUND = 0.75, 0.85  # of the demonstrations, exactly or within a frame: a task counts as found
-FRAMES = 'frames, in the bottleneck'  # a column
 KINDS = 'own', 'aside', 'without'  # tasks by TASKS; kept aside; trained without marks
 
 
@@ -220,29 +219,30 @@ def average(rows):
 
 def page(rows):
     """Write the page of the results, a line for each task."""
-    lengths, (tables, found) = {}, ({kind: {} for kind in KINDS} for _ in range(2))
+    tables, found = ({kind: {} for kind in KINDS} for _ in range(2))
     for row in rows:
         task, method, hit, near = (row[name] for name in ('task', 'method', 'hit', 'near'))
         kind = ('aside' if task.startswith('aside/') else 'own' if 'seeds' not in row
                 or method in WITH_MARKS else 'without')
-        if 'seeds' not in row:
-            lengths[task] = f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f}"
         line = tables[kind].setdefault(task, {
-            'task': re.sub('^(aside/)?(metaworld/)?', '', task).replace('/', ' '),
-            FRAMES: lengths[task]})
+            'task': re.sub('^(aside/)?(metaworld/)?', '', task).replace('/', ' ')})
         line[method] = f"{hit['value']:.0%}, {near['value']:.0%}" + (
             f"; {row['error']['value']:.2f}" if 'error' in row else '')
         found[kind].setdefault(method, []).append(
             any(value['value'] >= least for value, least in zip((hit, near), FOUND)))
     for kind, lines in tables.items():
-        lines['found'] = {'task': '**found**', FRAMES: ''} | {
+        lines['found'] = {'task': '**found**'} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
     lines = {kind: pd.DataFrame(list(lines.values())).drop(
         columns=['middle', 'random'], errors='ignore') for kind, lines in tables.items()}
-    chances = [row['near']['value'] for row in rows if row['method'] == 'random']
+    said = {}  # ranges over the tasks
+    for name, form, value in (('frames', '{:.0f}', lambda row: row['frames']),
+                              ('lasting', '{:.1f}', lambda row: row['bottleneck_frames']),
+                              ('chance', '{:.0%}', lambda row: row['near']['value'])):
+        values = [value(row) for row in rows if row['method'] == 'random']
+        said[name] = f'{form} to {form}'.format(min(values), max(values))
     return render('worlds/templates/worlds.md.j2', marked=MARKED, cuts=CUTS, found=found,
-                  chances=[f'{100 * each(chances):.0f}' for each in (min, max)],
-                  more=compare(rows) if found['aside'] else {}, **lines)
+                  more=compare(rows) if found['aside'] else {}, **said, **lines)
 
 
 def compare(rows):

@@ -113,7 +113,7 @@ def test_rows_are_kept_as_they_are_measured_and_what_was_interrupted_goes_on(
     with pytest.raises(KeyboardInterrupt):
         everything.measure('start', Options())
     assert kept() == {'a': '2', 'b': '1', 'c': '1'} and not everything.is_measured('start')
-    assert '(1 of today, 2 of today)' in page.read_text()
+    assert '(2 of today, 1 of today)' in page.read_text()
     fails = ''
     everything.run(everything.Options())
     assert kept() == {'a': '2', 'b': '2', 'c': '2'}
