@@ -215,14 +215,14 @@ class Tables:
 
     def speed(self):
         """List what `make bench` measured and has an aim, a column for each machine."""
-        found = {}
+        found, columns = {}, machines()
         for row in measured_speed()['rows']:
             if row['aim']:
                 here, ratio = Row(**{one.name: row[one.name] for one in fields(Row)}).cells[1:3]
                 found.setdefault((row['what'], row['aim']), {})[row['machine']] = (
                     f'{"" if row["reached"] else "**missed**: "}{here}; {ratio}')
         for (what, aim), cells in found.items():
-            yield (what, *(cells.get(machine, '') for machine in machines()), aim)
+            yield (what, *(cells.get(machine, '') for machine in columns), aim)
 
 
 def measured_speed():

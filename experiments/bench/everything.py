@@ -66,17 +66,18 @@ def measure(name, options):
     """
     part, origin, found = module(name), made_by(), []
     keep = change if options == part.Options() else lambda *_: None
-    keep(name, found, False)
+    machine = origin['machine']
+    keep(name, machine, found, False)
     for row in part.run(options):
         show(row)
         found.append({**asdict(row), 'reached': bool(row.reached), 'part': name, **origin})
-        keep(name, found, False)
-    keep(name, found, True)
+        keep(name, machine, found, False)
+    keep(name, machine, found, True)
 
 
-def change(name, found, is_all):
-    """Put what was found of a part so far into the data, and the page's table made of them."""
-    data, machine = tables.measured_speed(), made_by()['machine']
+def change(name, machine, found, is_all):
+    """Put what a machine found of a part so far into the data, and into the page's table."""
+    data = tables.measured_speed()
     parts = {part: [row for row in data['rows'] if row['part'] == part] for part in PARTS}
     new = {row['what']: row for row in found}
     kept = [row if row['machine'] != machine else new.pop(row['what'], None if is_all else row)
