@@ -64,10 +64,15 @@ def test_work_is_done_in_turns_alone_and_beside_others():
         return 1 + found[-1]
 
     before = children()
-    row = busy.compare(busy.Work('nothing', 1, seconds), 2, 3)
-    assert found == [0, 3, 0, 3] and children() == before
-    assert row.ratio == 4 and row.reached == (busy.CORES == 1)
-    assert row.what == 'nothing beside 3 busy processes' and row.to == 'alone (4.00 to 4.00)'
+    for slower, reached in ((3, False), (4, True)):
+        found.clear()
+        row = busy.compare(busy.Work('nothing', 1, seconds), 2, 3,
+                           lambda: slower if children() > before else 1)
+        assert found == [0, 3, 0, 3] and children() == before
+        assert row.ratio == 4 and row.reached == reached
+        assert row.what == 'nothing beside 3 busy processes'
+        assert row.to == f'alone (4.00 to 4.00); a loop {slower:.2f} x'
+    assert busy.time_loop(2) > 0
 
 
 def test_a_row_that_misses_its_aim_says_why():
