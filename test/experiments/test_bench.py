@@ -71,7 +71,7 @@ def test_work_is_done_in_turns_alone_and_beside_others():
     assert found == [0, 3, 0, 3] * 2 and children() == before
     assert [row.ratio for row in rows] == [4, 4] and [row.reached for row in rows] == [False, True]
     assert rows[0].what == 'nothing beside 3 busy processes'
-    assert rows[0].to == 'alone (4.00 to 4.00); a loop 3.00 x'
+    assert rows[0].to == 'alone (4.00 to 4.00); loop 3.00'
     assert busy.time_loop(2) > 0
 
 

@@ -81,8 +81,8 @@ def compare(work, pairs, count, loop=None):
     reached = bool(np.median(ratios) <= LEEWAY * share)
     return Row(f'{work.what} beside {count} busy processes',
                f'{1000 * np.median(times[:, 1]):,.1f} ms', float(np.median(ratios)),
-               f'alone ({ratios.min():.2f} to {ratios.max():.2f}); a loop {share:.2f} x',
-               f'at most {LEEWAY} x the loop', reached,
+               f'alone ({ratios.min():.2f} to {ratios.max():.2f}); loop {share:.2f}',
+               f'{LEEWAY} x loop', reached,
                '' if reached else 'waiting for a core')
 
 
