@@ -212,8 +212,9 @@ def main(options):
         print(f'{name}: no digests are known; write them with --write on a commit to compare with')
         return 0
     before = known[name]
-    differ = [what for what in {**before, **found} if before.get(what) != found.get(what)]
-    print('\n'.join(f'DIFFERENT: {what}' for what in differ) or 'all as before')
+    differ = [what for what in before if before[what] != found.get(what)]
+    print('\n'.join([f'not known here: {what}' for what in found if what not in before]
+                    + [f'DIFFERENT: {what}' for what in differ] or ['all as before']))
     return 1 if differ else 0
 
 

@@ -22,7 +22,8 @@ SHIPPED = {
     'push3': ('push3', {'push3': {'episodes': 600}}),
     'stack2': ('stack2', {'stack2': {'episodes': 1000}}),
     'stack3': ('stack3', {'stack3': {'episodes': 1000}}),
-    'grasp': ('grasp', {'grasp': {'episodes': 3000}}),
+    'grasp': ('grasp', {'grasp': {'episodes': 3000},
+                        'grasp_more': {'episodes': 3000, 'seed': 100_000}}),
     'grasp_forward': ('grasp', {'grasp': {'episodes': 3000}}),
     'pick_place': ('pick_place', {'pick_place': {'episodes': 3000}}),
     'pick_place_vae': ('pick_place', {'pick_place': {'episodes': 3000}})}

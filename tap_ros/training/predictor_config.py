@@ -227,7 +227,7 @@ RECIPES = {  # the first stands for recordings of other tasks
     'push3': replace(_PUSH, initial_weights='push2', steps=3000),
     'stack2': _GRIPPING,
     'stack3': _GRIPPING,
-    'grasp': _GRIPPING,
+    'grasp': replace(_GRIPPING, steps=10000),
     'grasp_forward': replace(_GRIPPING, mode='forward', selection='absolute'),
     'pick_place': replace(_GRIPPING, steps=10000),
     'pick_place_vae': replace(

@@ -85,7 +85,7 @@ class Options:
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
     """
 
-    scenes: int = 8
+    scenes: int = 6
     seed: int = FIRST_SCENE
     tasks: Annotated[tuple[str, ...], conf.arg(
         help='what is to be done in them; none named: order2 and order3; of the table those that '
