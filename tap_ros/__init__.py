@@ -62,6 +62,7 @@ _EXPORTS = {
     'iter_episodes': 'tap_ros.recording.reader',
     'load_plugin': 'tap_ros.base.plugins',
     'load_predictor': 'tap_ros.prediction.protocol',
+    'Memory': 'tap_ros.planning.visual_mpc',
     'Mount': 'tap_ros.robots.arm',
     'Observation': 'sim_bridge.world.protocol',
     'open_recordings': 'tap_ros.recording.cache',

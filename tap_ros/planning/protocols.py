@@ -78,9 +78,9 @@ class Problem:
 
     :param cost: Judge; it raises where time is over, and the planner takes the best so far.
     :param mean: (D,) of the first Gaussian; std: (D,).
-    :param clip: limits samples (N, D) to what is allowed.
-    :param proposals: (P, D), samples that are worth a look.
-    :param kept: (E, D), elites of the plan before, one step later.
+    :param clip: limits samples (N, D), not a single one (D,), to what is allowed.
+    :param proposals: (P, D), samples that are worth a look, or None.
+    :param kept: (E, D), elites of the plan before, one step later, or None.
     :param moves: T; the first 2 T parameters are x, y of T displacements, one after the other.
     :param recheck: a dearer Judge, for the last elites alone.
     """

@@ -85,7 +85,7 @@ class Options:
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
     """
 
-    scenes: int = 6
+    scenes: int = 5
     seed: int = FIRST_SCENE
     tasks: Annotated[tuple[str, ...], conf.arg(
         help='what is to be done in them; none named: order2 and order3; of the table those that '
@@ -216,6 +216,8 @@ def run_scenes(args: Options, folder: Path,
             stack.callback(nodes.close)
         start(sets, args.plan[0][0])
         for task, seed in args.plan:
+            if sys.stdout.isatty():
+                print(f'  {task} {seed} ...', end='\r', flush=True)
             yield run_scene(sets, task, seed)
 
 
