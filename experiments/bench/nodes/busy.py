@@ -3,9 +3,8 @@
 """
 The same work alone and beside processes that spin, one a core, in turns.
 
-Some is slower because others have a share of the cores, and because cores that are threads of one
-core slow each other down. A loop that only counts, in as many processes as the work has threads,
-shows how much that is; what is more is lost.
+Beside N processes that spin on c cores, each of t threads that work gets c / (t + N) of a core.
+So work that keeps t cores busy when alone takes (t + N) / c times as long; what is more is lost.
 """
 
 from collections.abc import Callable
@@ -14,8 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 import os
 from pathlib import Path
-import subprocess
-import sys
 import tempfile
 import time
 
@@ -35,8 +32,6 @@ from tap_ros.training.predictor_config import TrainingConfig
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
 CORES = len(os.sched_getaffinity(0))
-LOOP = 'for i in range(10_000_000): pass'
-LEEWAY = 1.1  # that medians of a few pairs may differ by chance
 
 
 @dataclass(frozen=True)
@@ -69,30 +64,20 @@ def run(args):
             yield compare(work, args.pairs, args.spinning or CORES)
 
 
-def compare(work, pairs, count, loop=None):
-    """Do a work and a loop in turns alone and beside `count` processes; return the row."""
-    loop = loop or partial(time_loop, work.threads)
-    times, loops = np.empty((2, pairs, 2))
-    for i in range(pairs):
-        for j, others in enumerate((0, count)):
-            with recording.beside(others):
-                times[i, j], loops[i, j] = work.seconds(), loop()
-    ratios, share = times[:, 1] / times[:, 0], np.median(loops[:, 1] / loops[:, 0])
-    reached = bool(np.median(ratios) <= LEEWAY * share)
+def compare(work, pairs, count):
+    """Do a work in turns alone and beside `count` processes; return the row."""
+    times = np.empty((pairs, 2))
+    for pair in times:
+        pair[0] = work.seconds()
+        with recording.beside(count):
+            pair[1] = work.seconds()
+    ratios, share = times[:, 1] / times[:, 0], (work.threads + count) / CORES
+    reached = bool(np.median(ratios) <= share)
     return Row(f'{work.what} beside {count} busy processes',
                f'{1000 * np.median(times[:, 1]):,.1f} ms', float(np.median(ratios)),
-               f'alone ({ratios.min():.2f} to {ratios.max():.2f}); loop {share:.2f}',
-               f'{LEEWAY} x loop', reached,
+               f'alone ({ratios.min():.2f} to {ratios.max():.2f})',
+               f'at most {share:.1f}', reached,
                '' if reached else 'waiting for a core')
-
-
-def time_loop(count):
-    """Count in so many processes at once; return s."""
-    begin = time.perf_counter()
-    loops = [subprocess.Popen([sys.executable, '-S', '-c', LOOP]) for _ in range(count)]
-    for loop in loops:
-        loop.wait()
-    return time.perf_counter() - begin
 
 
 def works(stack):
