@@ -24,6 +24,7 @@ from tap_ros.planning.protocols import Problem as Problem
 from tap_ros.planning.protocols import SearchConfig as SearchConfig
 from tap_ros.planning.protocols import Solution as Solution
 from tap_ros.planning.protocols import Solver as Solver
+from tap_ros.planning.visual_mpc import Memory as Memory
 from tap_ros.planning.visual_mpc import Scene as Scene
 from tap_ros.planning.visual_mpc import VisualMPC as VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor as SubgoalPredictor
