@@ -66,9 +66,8 @@ def in_words(row: Row) -> str:
     direct, via = row.reached
     sure = 'its interval excludes zero' if row.nearer.low > 0 else 'which chance may explain'
     if row.scenes == 1:
-        nearer = 'nearer to' if row.nearer.value >= 0 else 'farther from'
-        return (f'One scene, which proves nothing: objects end {abs(row.nearer.value):.1f} cm '
-                f'{nearer} their goals via the predicted subgoal.')
+        return (f'One scene, which proves nothing: objects end {row.nearer.value:.1f} cm nearer '
+                'to their goals via the predicted subgoal.')
     return (f'Via the predicted subgoal {via} of {row.scenes} scenes succeed, directly {direct}; '
             f'objects end {row.nearer.value:.1f} cm nearer to their goals '
             f'({row.nearer.low:.1f} to {row.nearer.high:.1f}), {sure}.')
