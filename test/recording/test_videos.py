@@ -134,3 +134,14 @@ def test_a_frame_is_shown_only_where_it_is_near_what_is_asked_for():
     video = Video(Path('v'), frames([0, 0.1, 2.0, 2.1]), 0.1)  # frames are missing between
     assert [video.at(s)[0] for s in (0, 0.1, 0.2, 1.9, 2.0, 2.1)] == [0, 0.1, 0.1, 2.0, 2.0, 2.1]
     assert video.now[1] is not None
+
+
+def test_a_camera_that_no_video_is_named_after_is_refused_with_their_names(tmp_path, capsys):
+    for demonstration in ('1', '2'):
+        (tmp_path / 'in' / demonstration).mkdir(parents=True)
+        for camera in ('side', 'top'):
+            write_video(tmp_path / 'in' / demonstration / f'{camera}.mp4', make_frames(3), 10)
+    code, said = run_import(capsys, 'import-video', tmp_path / 'in', '--out', tmp_path / 'bag',
+                            '--camera', 'front')
+    assert code == 1 and 'holds no video of that name; expected one of side, top' in said
+    assert not (tmp_path / 'bag').exists()

@@ -164,6 +164,9 @@ def _of_camera(path: Path, found: list[Path], camera: str = '') -> list[Path]:
     if not camera and 1 < len(names) < len(found):
         raise ConfigError(f'--camera: expected one of {listing(sorted(names))}, which '
                           f'{escaped(path)} holds of several demonstrations')
+    if camera and camera not in names:
+        raise ConfigError(f'--camera {escaped(camera)}: {escaped(path)} holds no video of that '
+                          f'name; expected one of {listing(sorted(names), 8)}')
     return [file for file in found if camera in ('', file.stem)]
 
 
