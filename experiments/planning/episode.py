@@ -143,7 +143,7 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=(
         subgoals = choose_sample(
             mpc, Scene(now, seen.gripper, start), end, found,
             lambda *leg: mpc.plan(*leg, Memory(seed)))
-        return targets_by(subgoals, end), subgoals
+        return targets_by(subgoals, start, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []
     order = simulator.scene.order

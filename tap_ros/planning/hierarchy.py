@@ -25,6 +25,8 @@ from tap_ros.planning.visual_mpc import Goal, Plan, Scene, VisualMPC
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
 
+AFTER_PUSH = 1.5  # times as far a subgoal is reached in the step after a push
+
 
 @dataclass(frozen=True)
 class Target:
@@ -48,15 +50,19 @@ class Target:
         can be anywhere in the picture. An object whose map is evenly undecided between two places
         is thus there in either: waiting until it is half way would be waiting for nothing.
         """
+        gaps = self.distances(pixels)
+        return float(gaps.mean() if self.free is None else gaps[~self.free].mean())
+
+    def distances(self, pixels: ArrayLike) -> np.ndarray:
+        """Return the distance (K,) of each object, in pixels, see distance."""
         pixels = np.asarray(pixels, np.float32)
         if self.maps is None:
-            gaps = np.linalg.norm(pixels - self.pixels, axis=1)
-        else:
-            edges = np.clip(pixels, 0, np.array(self.maps.shape[:0:-1], np.float32) - 1)
-            gaps = np.linalg.norm(pixels - edges, axis=1)  # of those outside
-            gaps = [gap + cv2.remap(table, edge[:1, None], edge[1:, None], cv2.INTER_LINEAR).item()
-                    for gap, table, edge in zip(gaps, self._excess, edges, strict=True)]
-        return float(np.mean(gaps) if self.free is None else np.asarray(gaps)[~self.free].mean())
+            return np.asarray(np.linalg.norm(pixels - self.pixels, axis=1))
+        edges = np.clip(pixels, 0, np.array(self.maps.shape[:0:-1], np.float32) - 1)
+        outside = np.linalg.norm(pixels - edges, axis=1)
+        return outside + [
+            cv2.remap(table, edge[:1, None], edge[1:, None], cv2.INTER_LINEAR).item()
+            for table, edge in zip(self._excess, edges, strict=True)]
 
     @cached_property
     def _excess(self) -> np.ndarray:
@@ -96,31 +102,50 @@ class Itinerary:
         if self.switch not in SWITCHES:
             raise ConfigError(f'switch {self.switch!r} is unknown; expected one of {SWITCHES}')
 
-    def stage(self, step: int, pixels: np.ndarray, stage: int = 0) -> int:
+    def stage(self, step: int, pixels: np.ndarray, stage: int = 0, lifted: bool = False) -> int:
         """
         Return the index of the target of this step.
 
         :param step: control periods that have passed.
         :param pixels: (K, 2), where the objects are.
         :param stage: of the step before.
+        :param lifted: the hand has just risen after a push. A subgoal is then reached from
+            AFTER_PUSH times as far: coming back for the rest costs more commands than it is worth.
         """
+        reached = self.reached * (AFTER_PUSH if lifted else 1)
         while stage < len(self.targets) - 1:
             late = step >= (stage + 1) * self.step_budget // len(self.targets)
             if not late and (self.switch == 'half'
-                             or not self.targets[stage].distance(pixels) <= self.reached):
+                             or not self.targets[stage].distance(pixels) <= reached):
                 break
             stage += 1
         return stage
 
 
-def targets_by(subgoals: Iterable['Subgoal'], goal_pixels: np.ndarray) -> list[Target]:
+def targets_by(subgoals: Iterable['Subgoal'], pixels: np.ndarray,
+               goal_pixels: np.ndarray) -> list[Target]:
     """
     Return the Targets of a way to the goal.
 
     :param subgoals: list of prediction.predictor.Subgoal to pass by, earliest first; may be empty.
+    :param pixels: (K, 2), where the objects are now.
     :param goal_pixels: (K, 2), the last target.
     """
-    return [*(Target(s.expected_pixels, s.object_maps) for s in subgoals), Target(goal_pixels)]
+    passed = [Target(s.expected_pixels, s.object_maps) for s in subgoals]
+    return [*(_decided(target, pixels, goal_pixels) for target in passed), Target(goal_pixels)]
+
+
+def _decided(target: Target, pixels: np.ndarray, goal_pixels: np.ndarray) -> Target:
+    """
+    Return a subgoal that says which objects go first.
+
+    One whose maps are undecided is reached where the objects are, before anything was pushed.
+    Those go first that may as well be at their goals by it; the others stay.
+    """
+    if target.distance(pixels) > GOAL_TOLERANCE:
+        return target
+    first = target.distances(goal_pixels) <= GOAL_TOLERANCE
+    return Target(np.where(first[:, None], goal_pixels, pixels).astype(np.float32))
 
 
 def choose_sample(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,

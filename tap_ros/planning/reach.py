@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tap_ros.base.contract import GOAL_TOLERANCE, LOST, step_budget, UNSURE
 from tap_ros.base.text import listing
-from tap_ros.planning.action_sequences import FULL, Limits
+from tap_ros.planning.action_sequences import DOWN, FULL, Limits
 from tap_ros.planning.hierarchy import Itinerary, Target
 from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 
@@ -319,7 +319,8 @@ class Reach:
             self._next = replace(state, memory=plan.memory)
             return Command(plan, len(state.switches), seen)
         before = len(state.switches) - len(state.earlier)
-        stage = itinerary.stage(self.steps - state.first_step, pixels, before)
+        lifted = 0 < state.memory.heights[0] <= DOWN < seen.gripper[2]
+        stage = itinerary.stage(self.steps - state.first_step, pixels, before, lifted)
         self._next = state = replace(
             state, switches=state.switches + (self.steps,) * (stage - before))
         if (0 < stage == len(itinerary.targets) - 1 and state.round < config.rounds

@@ -2,14 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of hierarchical planning: which target comes when, and how subgoals are chosen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.planning.action_sequences import gripper_after, Limits
 from tap_ros.planning.hierarchy import (
+    AFTER_PUSH,
     choose_sample,
     Itinerary,
     Target,
+    targets_by,
 )
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.protocols import SearchConfig
@@ -43,6 +47,12 @@ def test_half_gives_every_target_its_share_and_reached_goes_on_at_once_but_no_la
     assert stages(Itinerary(targets(2), 12, reached=0.0), on_the_spot + 1e-3)[5] == 0
 
 
+def test_a_subgoal_is_reached_from_farther_off_when_the_hand_has_just_risen():
+    itinerary, near = Itinerary(targets(2), 12, reached=2.0), PLACES + [2.5, 0.0]
+    assert itinerary.stage(3, near) == 0 and itinerary.stage(3, near, lifted=True) == 1
+    assert itinerary.stage(3, PLACES + [2.0 * AFTER_PUSH + 0.1, 0.0], lifted=True) == 0
+
+
 def test_free_objects_count_for_nothing_and_shall_stay_where_they_are():
     target = Target(PLACES, free=np.array([False, True]))
     now = np.array([[8.0, 11.0], [50.0, 50.0]])
@@ -72,6 +82,21 @@ def subgoal(pixels, sample=0, level=1):
     picture = np.full((32, 32, 3), 90, np.uint8)
     return Subgoal(picture, maps, np.asarray(pixels, np.float32), np.ones(2, np.float32),
                    sample, level)
+
+
+def test_an_undecided_subgoal_moves_first_what_may_be_at_its_goal():
+    start, goal = PLACES, PLACES + [[8.0, 0.0], [0.0, 8.0]]
+    at_start, at_goal = (one_hot_maps(torch.tensor(p), (32, 32)).numpy() for p in (start, goal))
+    decided = subgoal(np.array([goal[0], start[1]]))
+    undecided, unmoved = (replace(decided, object_maps=np.stack([share * at_goal[0]
+                                  + (1 - share) * at_start[0], at_start[1]]))
+                          for share in (0.5, 0.0))
+    for one, pixels in ((decided, decided.expected_pixels), (undecided, [goal[0], start[1]]),
+                        (unmoved, start)):
+        first, last = targets_by([one], start, goal)
+        assert (first.maps is None) == (one is not decided)
+        np.testing.assert_allclose(first.pixels, pixels, atol=0.01)
+        np.testing.assert_array_equal(last.pixels, goal)
 
 
 def scene(pixels):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tap_ros.base.contract import LIFTED
+from tap_ros.base.contract import LIFTED, LOW
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.protocols import SearchConfig
@@ -73,6 +73,20 @@ def test_a_goal_that_is_reached_ends_at_once_and_the_default_budget_is_the_paper
     assert reach._budget == 40
     end = reach.step(look(1, GOAL.pixels))
     assert isinstance(end, End) and end.outcome == 'reached' and reach.steps == 0
+
+
+def test_a_subgoal_counts_from_farther_off_once_the_hand_has_risen_from_a_push(mpc):
+    subgoal, stages = Target(START + [1.3, 0.0]), []
+    for low in (False, True):
+        reach = Reach(mpc, ReachConfig(10))
+        for t, height in enumerate((LOW if low else LIFTED, LIFTED)):
+            seen = look(t, gripper=np.array([0, 0, height, 0], np.float32))
+            if not t:
+                assert isinstance(reach.step(seen), SelectTargets)
+                reach.set_targets([subgoal, GOAL])
+            stages.append(reach.step(seen).stage)
+            reach.sent()
+    assert stages == [0, 0, 0, 1]
 
 
 def test_what_is_not_sent_leaves_no_trace(mpc):

@@ -83,7 +83,7 @@ class GoalSource:
             objects, 'goal_objects', None if picture is None else picture.shape[:2])
         goal_pixels = match_objects(seen.names, names, pixels, 'objects', 'goal_objects')
         if self._mode != 'subgoal' or picture is None:
-            return targets_by([], goal_pixels)
+            return targets_by([], seen.pixels, goal_pixels)
 
         def plan(scene: Scene, goal: Goal) -> Plan:
             go_on()
@@ -93,7 +93,8 @@ class GoalSource:
         subgoals = self._ask_subgoals(seen, picture, goal_pixels, go_on)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         scene = Scene(seen.image, seen.gripper, seen.pixels)
-        return targets_by(choose_sample(mpc, scene, goal_pixels, subgoals, plan), goal_pixels)
+        return targets_by(choose_sample(mpc, scene, goal_pixels, subgoals, plan), seen.pixels,
+                          goal_pixels)
 
     def _take(self, go_on: Callable[[], None]) -> tuple[np.ndarray | None, ObjectStates]:
         """
