@@ -204,7 +204,7 @@ class RigidTracker:
             pose = matcher.refine(key, place, one.angle, reach, turn)
             if pose.cost < best.cost - 0.03:
                 best = pose
-        if one.age and best.fit <= GOOD:
+        if one.age and best.fit <= GOOD or one.state != SEEN and not best.sure:
             avoid = [other.place for other in self._objects if other is not one]
             pose = matcher.locate(one.face, avoid)
             if (pose.fit > GOOD and pose.cost < min(MOST_COST, best.cost - 0.1)

@@ -79,6 +79,14 @@ def test_what_is_hidden_is_said_to_be_and_found_where_it_comes_out(tracker):
     assert found.states == (SEEN, SEEN) and np.abs(found.pixels - moved).max() < 1.5
 
 
+@pytest.mark.parametrize('turn', [2.0, 2.4])
+def test_what_turned_while_half_of_it_was_hidden_is_found_as_it_is(tracker, turn):
+    for step in (1, 2, 3):
+        tracker.update(draw(STARTS, (turn * step / 3, 0), robot=(76, 80, 120, 130)))
+    found = tracker.update(draw(STARTS, (turn, 0)))
+    assert found.states == (SEEN, SEEN) and np.abs(found.pixels - STARTS).max() < 0.7
+
+
 def test_what_the_hand_pushes_unseen_goes_along_with_it(tracker):
     u, v = STARTS[0]
     for step in range(10):
