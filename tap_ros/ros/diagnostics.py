@@ -14,6 +14,7 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from tap_msgs.msg import ObjectStates
 from tap_ros.base.text import escaped
 from tap_ros.ros.subscriptions import publishers_of, rivals, steady_timer, why_silent
 
@@ -60,7 +61,8 @@ class Diagnostics:
     Publishes the state of a node's work and inputs; its methods may be called from any thread.
 
     An input that falls silent, or never comes, is named in the log with the reason and the remedy;
-    so are cameras that publish on one topic.
+    so are cameras that publish on one topic. Objects may be silent while somebody publishes them:
+    a tracker waits for its selection.
 
     Status of the work: ERROR for ERROR_SECONDS after an error, else WARN with the reason while
     `idle` returns one, else OK.
@@ -137,6 +139,9 @@ class Diagnostics:
         self._shared = {*cameras}
         for topic in sorted(silent - self._told):
             why = why_silent(self._node, topic, types.get(topic))
+            if not why and types.get(topic) is ObjectStates:
+                silent.remove(topic)  # and told when they are no longer published
+                continue
             self._node.get_logger().warning(
                 f'nothing has come on {escaped(topic)} for {SILENT_SECONDS:g} s'
                 + (f': {why}' if why else ', though it is published'))

@@ -131,6 +131,24 @@ def test_a_recorder_that_hears_nothing_says_so_and_does_not_succeed(
         assert node.end() == 0
 
 
+def test_objects_that_wait_to_be_selected_are_nothing_to_warn_of(client, hurried, capfd):
+    objects = client.create_publisher(ObjectStates, 'objects', STREAM)
+    node = LocalNode(RecorderNode, topics=['joint_states', 'objects'], record_on_start=False)
+    try:
+        assert until(lambda: client.count_subscribers('/objects'))
+        said = []
+
+        def named(topic):
+            said.append(capfd.readouterr().err)
+            return f'nothing has come on {topic} for' in ''.join(said)
+        assert until(lambda: named('/joint_states'))
+        assert not until(lambda: named('/objects'), 2.5, pause=0.1)
+        client.destroy_publisher(objects)
+        assert until(lambda: named('/objects'))
+    finally:
+        assert node.end() == 0
+
+
 def statuses(message):
     """Return {name: (level, message, {key: value})}."""
     return {status.name: (status.level, status.message, {v.key: v.value for v in status.values})
