@@ -138,7 +138,7 @@ def test_a_planner_stops_the_arm_and_ends_when_who_started_it_is_killed(tmp_path
     assert 'reach_goal ended' in log and not errors_in(log), log
 
 
-SLOW = '''
+SLOW = """
 import os, signal, sys, time
 from types import SimpleNamespace
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -167,7 +167,7 @@ class Slow(Node):
 
 run.NODE_CLASSES = {'slow': '__main__:Slow'}
 sys.exit(run.main('slow', []))
-'''
+"""
 
 
 def test_a_callback_that_runs_when_the_node_is_ended_has_what_it_needs():
