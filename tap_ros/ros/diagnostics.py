@@ -80,7 +80,7 @@ class Diagnostics:
     def __init__(self, node: Node, streams: Iterable[str], others: Iterable[str] = (),
                  queue: Callable[[], int] | None = None,
                  idle: Callable[[], str] = lambda: '', expected: Iterable[str] = ()) -> None:
-        self._node, self._begun = node, time.monotonic()
+        self._node, self._begun = node, math.inf  # until the node is spun: before, it is deaf
         self._queue, self._idle = queue, idle
         self._lock = threading.Lock()
         self._max_age_s = {node.resolve_topic_name(topic): age for topics, age in (
@@ -114,6 +114,7 @@ class Diagnostics:
     def _publish(self) -> None:
         queue = {} if self._queue is None else {'queue': self._queue()}  # it may take locks
         now, idle = time.monotonic(), self._idle()
+        self._begun = min(self._begun, now)
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         with self._lock:
