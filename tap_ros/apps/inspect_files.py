@@ -80,7 +80,8 @@ def run(args: Options) -> None:
                        f'{np.median(lengths):g}'),
             ('objects', listing(sorted({len(e.object_names) for e in episodes}))),
             ('commands', listing(store.commands) or 'none'),
-            ('signals', listing(sorted({name for e in episodes for name in e.signal_names}))),
+            ('signals', listing(sorted({name for e in episodes for name in e.signal_names}))
+             or 'none'),
             ('robot masks', f'{masked} of {len(episodes)} episodes'),
             ('task', _counted(e.task for e in episodes)),
             ('outcome', _counted(e.outcome for e in episodes)), ('data hash', store.data_hash)):

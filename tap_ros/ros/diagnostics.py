@@ -14,6 +14,7 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from tap_msgs.msg import ObjectStates
 from tap_ros.base.text import escaped
 from tap_ros.ros.subscriptions import publishers_of, rivals, steady_timer, why_silent
 
@@ -60,7 +61,8 @@ class Diagnostics:
     Publishes the state of a node's work and inputs; its methods may be called from any thread.
 
     An input that falls silent, or never comes, is named in the log with the reason and the remedy;
-    so are cameras that publish on one topic.
+    so are cameras that publish on one topic. Objects may be silent while somebody publishes them:
+    a tracker waits for its selection.
 
     Status of the work: ERROR for ERROR_SECONDS after an error, else WARN with the reason while
     `idle` returns one, else OK.
@@ -78,7 +80,7 @@ class Diagnostics:
     def __init__(self, node: Node, streams: Iterable[str], others: Iterable[str] = (),
                  queue: Callable[[], int] | None = None,
                  idle: Callable[[], str] = lambda: '', expected: Iterable[str] = ()) -> None:
-        self._node, self._begun = node, time.monotonic()
+        self._node, self._begun = node, math.inf  # until the node is spun: before, it is deaf
         self._queue, self._idle = queue, idle
         self._lock = threading.Lock()
         self._max_age_s = {node.resolve_topic_name(topic): age for topics, age in (
@@ -112,6 +114,7 @@ class Diagnostics:
     def _publish(self) -> None:
         queue = {} if self._queue is None else {'queue': self._queue()}  # it may take locks
         now, idle = time.monotonic(), self._idle()
+        self._begun = min(self._begun, now)
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         with self._lock:
@@ -137,6 +140,9 @@ class Diagnostics:
         self._shared = {*cameras}
         for topic in sorted(silent - self._told):
             why = why_silent(self._node, topic, types.get(topic))
+            if not why and types.get(topic) is ObjectStates:
+                silent.remove(topic)  # and told when they are no longer published
+                continue
             self._node.get_logger().warning(
                 f'nothing has come on {escaped(topic)} for {SILENT_SECONDS:g} s'
                 + (f': {why}' if why else ', though it is published'))

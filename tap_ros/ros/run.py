@@ -11,6 +11,7 @@ from pathlib import Path
 import signal
 import sys
 import threading
+import time
 from typing import Any
 
 import rclpy
@@ -102,11 +103,20 @@ def main(name: str = '', args: list[str] | None = None) -> int:
         if heartbeat is not None:
             heartbeat.end()
         if executor is not None:
-            executor.shutdown(timeout_sec=2.0)
+            _finish(executor, 2.0)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
     return code
+
+
+def _finish(executor: Any, seconds: float) -> None:
+    """Wait for callbacks that threads have begun, as shutdown of rclpy does not, and end."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and not all(
+            task.done() for task in getattr(executor, '_futures', ())):
+        time.sleep(0.01)
+    executor.shutdown()
 
 
 def warn_of_unknown_parameters(node: Any) -> None:

@@ -136,3 +136,40 @@ def test_a_planner_stops_the_arm_and_ends_when_who_started_it_is_killed(tmp_path
                 os.kill(planner, signal.SIGKILL)
     log = (tmp_path / 'visual_mpc_node.log').read_text()
     assert 'reach_goal ended' in log and not errors_in(log), log
+
+
+SLOW = """
+import os, signal, sys, time
+from types import SimpleNamespace
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from std_msgs.msg import String
+from tap_ros.ros import run
+
+class Slow(Node):
+    num_threads = 4
+
+    def __init__(self, **options):
+        super().__init__('slow', **options)
+        self.params, self.count = SimpleNamespace(given=set()), 0
+        self.publisher = self.create_publisher(String, 'words', 1)
+        self.create_timer(0.05, self.work, ReentrantCallbackGroup())
+
+    def work(self):
+        self.count += 1
+        if self.count == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.5)
+        self.publisher.publish(String())
+
+    def close(self):
+        return 0
+
+run.NODE_CLASSES = {'slow': '__main__:Slow'}
+sys.exit(run.main('slow', []))
+"""
+
+
+def test_a_callback_that_runs_when_the_node_is_ended_has_what_it_needs():
+    run = subprocess.run([sys.executable, '-c', SLOW], capture_output=True, text=True, timeout=300)
+    assert (run.returncode, run.stderr) == (0, '')

@@ -3,6 +3,7 @@
 """What log and /diagnostics say: of inputs and work, of silence."""
 
 from threading import Thread
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from processes import Client, LocalNode, Newest, until
@@ -127,6 +128,41 @@ def test_a_recorder_that_hears_nothing_says_so_and_does_not_succeed(
         said.clear()
         timer.cancel()
         assert until(lambda: warned('/camera/image_raw/compressed', 'though it is published'))
+    finally:
+        assert node.end() == 0
+
+
+def test_a_node_is_not_told_of_silence_while_it_started(client, hurried, capfd):
+    pictures = client.create_publisher(Image, 'camera/image_raw', STREAM)
+    client.create_timer(0.1, lambda: pictures.publish(Image()))
+
+    def slowly(**options):
+        made = RecorderNode(**options)
+        time.sleep(3.0)
+        return made
+
+    node = LocalNode(slowly, topics=['camera/image_raw'], record_on_start=False)
+    try:
+        assert until(lambda: node.node._diagnostics._inputs['/camera/image_raw'].count > 10)
+    finally:
+        assert node.end() == 0
+    assert 'nothing has come' not in capfd.readouterr().err
+
+
+def test_objects_that_wait_to_be_selected_are_nothing_to_warn_of(client, hurried, capfd):
+    objects = client.create_publisher(ObjectStates, 'objects', STREAM)
+    node = LocalNode(RecorderNode, topics=['joint_states', 'objects'], record_on_start=False)
+    try:
+        said = []
+
+        def named(topic, why):
+            said.append(capfd.readouterr().err)
+            return f'nothing has come on {topic} for 1 s{why}' in ''.join(said)
+        assert until(lambda: named('/joint_states', ': no node'))
+        assert until(lambda: node.node.count_publishers('/objects'))
+        assert not until(lambda: named('/objects', ', though'), 2.5, pause=0.1)
+        client.destroy_publisher(objects)
+        assert until(lambda: named('/objects', ': no node'))
     finally:
         assert node.end() == 0
 

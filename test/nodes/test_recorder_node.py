@@ -168,3 +168,19 @@ def test_topics_of_any_type_can_be_recorded_beside_where_the_arm_stands_and_its_
     stood = UR10E.mount
     assert read_mount(tmp_path / 'bag') == ArmMount(
         Mount((0.25, *stood.position[1:]), stood.yaw, stood.tool), 0.5)
+
+
+def test_the_mask_of_the_last_picture_is_waited_for(client, record, tmp_path):
+    images, masks = (client.create_publisher(Image, name, STREAM)
+                     for name in ('camera/image_raw', 'camera/robot_mask'))
+    record()
+    arrived(images, masks)
+    masks.publish(random_image(1))
+    images.publish(random_image(1))
+    images.publish(random_image(2))
+    arrived(images, masks)
+    client.create_timer(0.3, lambda: masks.publish(random_image(2)))
+    ask(client, False)
+    last = [topic for topic, _, message in read(tmp_path / 'bag')
+            if topic.startswith('/camera') and message.header.stamp.nanosec == 2]
+    assert last == ['/camera/image_raw', '/camera/robot_mask']

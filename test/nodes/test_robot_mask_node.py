@@ -3,6 +3,7 @@
 """robot_mask_node: masks with the stamps of the pictures, or the reason; and what fills them."""
 
 from importlib.util import find_spec
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
@@ -11,7 +12,7 @@ import numpy as np
 from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from tap_ros.base.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.base.errors import ImageError, TapError
 from tap_ros.messages.images import decode_camera_info, decode_mask
@@ -105,6 +106,27 @@ def test_without_a_robot_or_its_joints_there_is_no_mask_and_the_reason(client):
             diagnostics.wait(30, tells_why)
         finally:
             node.end()
+
+
+def test_joints_that_wait_behind_the_picture_are_taken_before_it_is_given_up(client, capfd):
+    masks = Newest(client, Image, 'slow/camera/robot_mask', STREAM)
+    cameras, joints = (client.create_publisher(kind, f'slow/{name}', STREAM) for kind, name in (
+        (CameraInfo, 'camera/camera_info'), (JointState, 'joint_states')))
+    node = LocalNode(RobotMaskNode, '/slow', **CAMERA, urdf='ur10e')
+    try:
+        assert until(cameras.get_subscription_count) and until(joints.get_subscription_count)
+        begun = []
+        busy = node.node.create_timer(
+            0.01, lambda: (busy.cancel(), begun.append(busy), time.sleep(2.0)))
+        assert until(lambda: begun)
+        for stamp in (10**9, 2 * 10**9):
+            joints.publish(JointState(
+                header=Header(stamp=to_stamp(stamp)), name=UR10E.joints, position=[0.0] * 6))
+        cameras.publish(encode_camera_info(np.eye(3), (64, 64), to_stamp(2 * 10**9), 'eye'))
+        assert masks.wait(20).header.stamp.sec == 2
+    finally:
+        node.end()
+    assert 'ERROR' not in capfd.readouterr().err
 
 
 def test_of_two_cameras_and_of_what_fails_there_is_no_mask_and_the_reason(client, capfd):

@@ -12,10 +12,12 @@ import subprocess
 import sys
 
 import cv2
+import numpy as np
 import pytest
 import tap_ros
 from tap_ros.apps.cli import read
 from tap_ros.base.errors import TapError
+import yaml
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.md',
@@ -54,6 +56,13 @@ def test_the_python_of_the_readme_runs_and_prints_what_it_says(tmp_path):
     said, = re.findall(r'print\(.*# (\[\[.*\]\])', block)
     assert run.stdout.split() == said.split()
     assert cv2.imread(str(tmp_path / 'subgoal.png')).shape == (256, 256, 3)
+
+
+def test_the_clicks_of_the_page_are_on_the_objects_that_the_simulator_shows_first():
+    page = (ROOT / 'docs' / 'ros.md').read_text()
+    asked = yaml.safe_load(re.search(r"SelectObjects '(.*)'", page)[1])
+    objects = tap_ros.Simulator('push2').reset(seed=0).object_pixels
+    assert abs(np.transpose([asked['u'], asked['v']]) - objects).max() < 1.0
 
 
 @pytest.mark.parametrize('page', WRITTEN, ids=of)

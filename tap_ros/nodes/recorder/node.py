@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+import struct
 import time
 from typing import Any
 
@@ -21,7 +22,9 @@ from tap_ros.messages.topics import (
     CONTROL_PERIOD,
     default_qos,
     IMAGE,
+    OBJECTS,
     Qos,
+    ROBOT_MASK,
     Topic,
 )
 from tap_ros.recording.file_writer import BagWriter
@@ -36,6 +39,8 @@ from tap_ros.ros.subscriptions import AdaptiveSubscription, steady_timer
 from tap_ros.ros.topics import camera_image, message_class, SERVICE_QOS
 
 DEPTH = 100  # messages that may wait while the disk is slow
+HEADED = 12  # bytes of a serialized message up to the end of its stamp
+MASK_S = 1.0  # that the mask of a bag's last picture is waited for
 TRANSIENT_LOCAL = DurabilityPolicy.TRANSIENT_LOCAL
 
 
@@ -199,8 +204,12 @@ class RecorderNode(Node):
         self._wanted = [image if name == IMAGE.name else name for name in self.params['topics']]
         if not self._wanted:
             raise ConfigError('parameter topics: is empty; name at least one topic')
-        streams = {name for name in self._wanted if (known := _known(name)) and known.periodic}
+        # Who needs pictures alone has no objects, and who tracks them selects them first.
+        streams = {name for name in self._wanted if (known := _known(name)) and known.periodic
+                   and known is not OBJECTS}
         period = self.resolve_topic_name(CONTROL_PERIOD.name)
+        self._image, self._mask = map(self.resolve_topic_name, (image, ROBOT_MASK.name))
+        self._stamps: dict[str, tuple[int, ...]] = {}  # of the newest picture and mask
         self._diagnostics = Diagnostics(
             self, streams, {*self._wanted, period} - streams,
             expected=self._wanted if self.params['topics'] != [*BY_NAME] else ())
@@ -224,13 +233,24 @@ class RecorderNode(Node):
 
     def _finish(self) -> str:
         """Record what has arrived, such as the end of an episode, and finish the bag."""
-        for one in self._recorded.values():
-            for message, info in take_messages(one.subscription, DEPTH):
-                one.subscription.callback(message, info)
+        self._take(*self._recorded)
+        end = time.monotonic() + MASK_S
+        # Without its mask the last picture would cost the episode all of them.
+        while (self._bags.folder and time.monotonic() < end and self._mask in self._stamps
+               and self._stamps[self._mask] < self._stamps.get(self._image, ())):
+            time.sleep(0.01)
+            self._take(self._mask)
         recorded, text = self._bags.folder, self._bags.finish()
         if recorded and self._bags.failure is None:
             self.get_logger().info(f'recorded {text}')
         return text
+
+    def _take(self, *names: str) -> None:
+        """Record what has arrived on topics."""
+        for name in names:
+            subscription = self._recorded[name].subscription
+            for message, info in take_messages(subscription, DEPTH):
+                subscription.callback(message, info)
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         response.message = (f'recording to {escaped(self._bags.start())}' if request.data
@@ -269,6 +289,8 @@ class RecorderNode(Node):
 
     def _on_message(self, topic: str, type_name: str, data: bytes, info: dict[str, Any]) -> None:
         self._diagnostics.received(topic)
+        if topic in (self._image, self._mask) and len(data) >= HEADED:
+            self._stamps[topic] = struct.unpack_from('<iI', data, 4)
         asked = self._recorded[topic].qos
         qos = Qos(depth=1 if asked.durability == TRANSIENT_LOCAL else 10,
                   durability=asked.durability.name.lower(),

@@ -57,7 +57,7 @@ class RobotMaskNode(Node):
         self._camera = self.params.camera_pose()  # at the base itself there is none: as tf tells
         self._frames = FixedFrames(self)
         self._place = ArmPlace(self, self.params, self._frames)
-        # CameraInfo of pictures that have no mask yet, and when they were received.
+        # CameraInfo of pictures that have no mask yet, and when they were taken.
         self._waiting: deque[tuple[CameraInfo, float]] = deque(maxlen=WAITING)
         self._robot: Robot | None = None
         self._diagnostics = Diagnostics(
@@ -116,20 +116,21 @@ class RobotMaskNode(Node):
         except TapError as error:
             self._report(f'joint_states: {error}')
 
-    def _on_camera_info(self, message: CameraInfo, info: dict[str, Any]) -> None:
+    def _on_camera_info(self, message: CameraInfo) -> None:
         self._diagnostics.received('camera/camera_info')
-        self._waiting.append((message, reception_time(info)))
+        # From now on: while it stayed in the queue, its joints did, too.
+        self._waiting.append((message, time.monotonic()))
         self._answer_waiting()
 
     def _answer_waiting(self) -> None:
         """Publish the masks of all pictures whose joints are known by now."""
         for picture in list(self._waiting):
-            info, received = picture
+            info, taken = picture
             try:
                 mask = self._mask(info)
                 self._masks.publish(encode_mask(mask, info.header.stamp, info.header.frame_id))
             except TapError as error:
-                waited = time.monotonic() - received
+                waited = time.monotonic() - taken
                 if isinstance(error, KinematicsError) and waited <= self.params['max_silence']:
                     continue  # joints may come
                 self._report(error)
