@@ -158,7 +158,7 @@ class RigidTracker:
         if one.searched is not None and self._still(one, one.searched, picture):
             return
         one.searched, one.waits = None, one.waits - 1
-        if one.age and hand is not None:
+        if hand is not None:
             one.place = one.place + one.pushed(hand)
         matcher = Matcher(picture, self._covered(one, picture))
         pose = self._search(one, matcher, hand)
