@@ -25,7 +25,7 @@ class Plane:
     :param size: (height, width) of the pictures.
     :ivar working: (height, width) of the working picture.
     :ivar blur: px of it that an edge is wide at most, where it is enlarged.
-    :ivar top: (3, 3) homography of places of tops to working pixels.
+    :ivar levels: (3, 3) homographies of places at TOP, MIDDLE and 0 to working pixels.
     :ivar eye: (2,) m, the place that the camera is above.
     """
 
@@ -36,8 +36,7 @@ class Plane:
         self.working = max(round(height * scale), 1), max(round(width * scale), 1)
         self.blur = round(scale / 2) if scale > 1.5 else 0
         self._scale = np.array([self.working[1] / width, self.working[0] / height])
-        self._levels = {z: self._homography(camera, z) for z in (TOP, MIDDLE, 0.0)}
-        self.top = self._levels[TOP]
+        self.levels = {z: self._homography(camera, z) for z in (TOP, MIDDLE, 0.0)}
         self.eye = np.zeros(2) if camera is None else camera.pose[:2, 3]
 
     def _homography(self, camera: PinholeCamera | None, height: float) -> np.ndarray:
@@ -60,11 +59,11 @@ class Plane:
 
     def places(self, pixels: ArrayLike, height: float = TOP) -> np.ndarray:
         """Return the places (..., 2) that working pixels show, of TOP, MIDDLE or 0."""
-        return _project(np.linalg.inv(self._levels[height]), pixels)
+        return _project(np.linalg.inv(self.levels[height]), pixels)
 
     def pixels(self, places: ArrayLike, height: float = TOP) -> np.ndarray:
         """Return the working pixels (..., 2) of places at TOP, MIDDLE or 0."""
-        return _project(self._levels[height], places)
+        return _project(self.levels[height], places)
 
     def apart(self, other: 'Plane') -> float:
         """Return how far corners of the table are from those of another plane, working px."""

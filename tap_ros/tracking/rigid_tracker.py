@@ -184,21 +184,18 @@ class RigidTracker:
     def _search(self, one: _Object, matcher: Matcher, hand: np.ndarray | None) -> Pose:
         """Return the best pose near by, else anywhere."""
         grown = 1 + 0.5 * min(one.age, 4)
-        reach, turn, push = REACH * grown, TURN * min(grown, 2), np.zeros(2)
+        reach, turn, keys = REACH * grown, TURN * min(grown, 2), one.nearest()
+        others = [(key, one.place) for key in (*keys[1:2], one.face)]
         if hand is not None:
             near = (hand[:, 2] < HAND_HIGH) & (
                 np.linalg.norm(hand[:, :2] - one.place, axis=1) < HAND_FAR)
             if near.any():
-                push = hand[1, :2] - hand[0, :2]
+                others.append((keys[0], one.place + hand[1, :2] - hand[0, :2]))
             elif one.age == 0:
                 reach, turn = REST, REST_TURN
-        keys = one.nearest()
         best = matcher.refine(keys[0], one.place, one.angle, reach, turn)
         if best.fit > GOOD and best.cost < GOOD_COST:
             return best
-        others = [(key, one.place) for key in (*keys[1:2], one.face)]
-        if np.linalg.norm(push) > 0.01:
-            others.append((keys[0], one.place + push))
         for key, place in others:
             pose = matcher.refine(key, place, one.angle, reach, turn)
             if pose.cost < best.cost - 0.03:
@@ -262,5 +259,4 @@ class RigidTracker:
             tuple(self._plane.enlarge(self._outline(one)) for one in self._objects))
 
     def _outline(self, one: _Object | Pose) -> np.ndarray:
-        return self._plane.pixels(
-            one.template.placed(one.template.outline, one.place, one.angle))
+        return self._plane.pixels(one.template.placed(one.template.outline, one.place, one.angle))

@@ -3,12 +3,12 @@
 """A rigid template of an object on the plane of the tops, searched in pictures."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from tap_ros.tracking.picture import Palette, Picture
-from tap_ros.tracking.plane import EDGE
+from tap_ros.tracking.plane import EDGE, TOP
 from tap_ros.tracking.silhouette import top_face
 
 POINTS, RING = 120, 40  # of a template, inside and around
@@ -91,13 +91,13 @@ class Template:
 class Pose:
     """Where a template was found; angle relative to the picture that it was cut from."""
 
-    place: np.ndarray  # (2,) m
-    angle: float  # rad
-    cost: float  # 0 to 1.35; inf: it was not found
-    seen: float  # share of the points that the robot does not hide
-    fit: float  # share of those that have colours of the object
-    alone: bool  # what is around does not look like the object, too
     template: Template
+    place: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))  # (2,) m
+    angle: float = 0.0  # rad
+    cost: float = np.inf  # 0 to 1.35; inf: it was not found
+    seen: float = 0.0  # share of the points that the robot does not hide
+    fit: float = 0.0  # share of those that have colours of the object
+    alone: bool = False  # what is around does not look like the object, too
 
     @property
     def confidence(self) -> float:
@@ -127,11 +127,7 @@ class Matcher:
         self._likeness: dict[Template, np.ndarray] = {}
 
     def likeness(self, template: Template) -> np.ndarray:
-        """
-        Return how like the object's colours pixels are.
-
-        :return: (h * w + 1,) 0 to 1; 0 where it is covered, and at the end: beside the picture.
-        """
+        """Return how like its colours each pixel is, flat: 0 to 1, 0 if covered or beside."""
         if template not in self._likeness:
             like = 1 - template.palette.distance(self.picture.index) / FAR
             self._likeness[template] = np.append(like.clip(0) * ~self.covered, np.float32(0))
@@ -148,8 +144,8 @@ class Matcher:
         """
         apart, free = self._apart(template, self._look(template.points[::thin], places, angles),
                                   thin)
-        seen = _mean(free)
-        cost = _mean(np.minimum(apart, FAR)) / FAR + (HIDDEN - 1) * (1 - seen)
+        seen = free.mean(-1)
+        cost = np.minimum(apart, FAR).mean(-1) / FAR + (HIDDEN - 1) * (1 - seen)
         if len(template.ring):
             index = self._look(template.ring[::thin], places, angles)
             like, free = self.likeness(template).take(index), self._words.take(index) >= 0
@@ -158,7 +154,7 @@ class Matcher:
                 away = np.cos(template.outward[::thin] + angles[:, None]
                               - np.arctan2(y, x)) < 0.2  # (A, R)
                 like, free = like * away[:, None], free & away[:, None]
-            cost += AROUND * _mean(like) / np.maximum(_mean(free), 1e-3)
+            cost += AROUND * like.mean(-1) / np.maximum(free.mean(-1), 1e-3)
         return cost, seen
 
     def fit(self, template: Template, place: np.ndarray, angle: float) -> tuple[float, bool]:
@@ -195,7 +191,7 @@ class Matcher:
         X, Y = np.outer(c, x) - np.outer(s, y), np.outer(s, x) + np.outer(c, y)  # (A, P)
         u, v, scale = (np.add((across * X + down * Y)[:, None].astype(np.float32),
                               (places @ (across, down) + still)[None, :, None].astype(np.float32))
-                       for across, down, still in self.picture.plane.top)
+                       for across, down, still in self.picture.plane.levels[TOP])
         u, v = (np.floor(ray / scale + np.float32(0.5)).astype(np.int32) for ray in (u, v))
         return np.where((u < 0) | (u >= w) | (v < 0) | (v >= h), h * w, v * w + u)
 
@@ -218,11 +214,11 @@ class Matcher:
             total[seen < LEAST_SEEN] = np.inf
             i, j = np.unravel_index(total.argmin(), total.shape)
             if not np.isfinite(total[i, j]):
-                return _nowhere(template)
+                return Pose(template)
             best, turned = places[j], float(angles[i])
             reach, turn = reach * next_reach, turn * next_turn
-        return Pose(best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
-                    *self.fit(template, best, turned), template)
+        return Pose(template, best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
+                    *self.fit(template, best, turned))
 
     def locate(self, template: Template, avoid: Sequence[np.ndarray] = (),
                region: np.ndarray | float = 1.0, extra: Sequence[np.ndarray] = ()) -> Pose:
@@ -243,7 +239,7 @@ class Matcher:
                 break
             peaks.append(plane.places((u, v)))
             cv2.circle(dense, (int(u), int(v)), int(side * 0.7), 0, -1)
-        best = _nowhere(template)
+        best = Pose(template)
         for place in (*peaks, *extra):
             if (plane.calibrated and (np.abs(place) > EDGE).any()
                     or any(np.linalg.norm(place - other) < APART for other in avoid)):
@@ -273,16 +269,6 @@ class Matcher:
             (255 * like).astype(np.uint8), (u, v, 2 * half, 2 * half), (3, 15, 0.5))
         amount = float(like[v:v + height, u:u + width].sum()) / template.area
         return plane.places((u + half, v + half)), amount
-
-
-def _nowhere(template: Template) -> Pose:
-    return Pose(np.full(2, np.nan), 0.0, np.inf, 0.0, 0.0, False, template)
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Return the mean over the last axis, faster than numpy does."""
-    P = values.shape[-1]
-    return values.astype(np.float32) @ np.full(P, 1 / P, np.float32)
 
 
 def _round(side: int) -> np.ndarray:
