@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from tap_ros.tracking.picture import Palette, Picture
-from tap_ros.tracking.plane import EDGE, TOP
+from tap_ros.tracking.plane import EDGE, MIDDLE, TOP
 from tap_ros.tracking.silhouette import top_face
 
 POINTS, RING = 120, 40  # of a template, inside and around
@@ -264,11 +264,12 @@ class Matcher:
         plane, (h, w) = self.picture.plane, self.picture.size
         like = self.likeness(template)[:-1].reshape(h, w)
         half = min(max(6, round(template.area ** 0.5 * 0.6)), h // 2, w // 2)
-        u, v = (plane.pixels(place) - half).clip(0, (w - 2 * half, h - 2 * half)).astype(int)
+        corner = plane.pixels(place, MIDDLE) - half
+        u, v = corner.clip(0, (w - 2 * half, h - 2 * half)).astype(int)
         _, (u, v, width, height) = cv2.meanShift(
             (255 * like).astype(np.uint8), (u, v, 2 * half, 2 * half), (3, 15, 0.5))
         amount = float(like[v:v + height, u:u + width].sum()) / template.area
-        return plane.places((u + half, v + half)), amount
+        return plane.places((u + half, v + half), MIDDLE), amount
 
 
 def _round(side: int) -> np.ndarray:
