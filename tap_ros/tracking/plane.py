@@ -25,7 +25,8 @@ class Plane:
     :param size: (height, width) of the pictures.
     :ivar working: (height, width) of the working picture.
     :ivar blur: px of it that an edge is wide at most, where it is enlarged.
-    :ivar top: (3, 3) homography of places of tops to working pixels.
+    :ivar levels: (3, 3) homographies of places at TOP, MIDDLE and 0 to working pixels.
+    :ivar eye: (2,) m, the place that the camera is above.
     """
 
     def __init__(self, camera: PinholeCamera | None, size: tuple[int, int]) -> None:
@@ -35,9 +36,8 @@ class Plane:
         self.working = max(round(height * scale), 1), max(round(width * scale), 1)
         self.blur = round(scale / 2) if scale > 1.5 else 0
         self._scale = np.array([self.working[1] / width, self.working[0] / height])
-        self.top = self._homography(camera, TOP)
-        self._middle, self._base = (self._homography(camera, z) for z in (MIDDLE, 0.0))
-        self._from_top, self._from_middle = np.linalg.inv(self.top), np.linalg.inv(self._middle)
+        self.levels = {z: self._homography(camera, z) for z in (TOP, MIDDLE, 0.0)}
+        self.eye = np.zeros(2) if camera is None else camera.pose[:2, 3]
 
     def _homography(self, camera: PinholeCamera | None, height: float) -> np.ndarray:
         """Return the homography of a level plane to the working picture."""
@@ -57,35 +57,18 @@ class Plane:
         """Return pixels (..., 2) of the working picture in that of the camera."""
         return (np.asarray(pixels, np.float64) + 0.5) / self._scale - 0.5
 
-    def of_top(self, pixels: ArrayLike) -> np.ndarray:
-        """Return the places (..., 2) of working pixels that show tops."""
-        return project(self._from_top, pixels)
+    def places(self, pixels: ArrayLike, height: float = TOP) -> np.ndarray:
+        """Return the places (..., 2) that working pixels show, of TOP, MIDDLE or 0."""
+        return _project(np.linalg.inv(self.levels[height]), pixels)
 
-    def of_middle(self, pixels: ArrayLike) -> np.ndarray:
-        """Return the places (..., 2) of working pixels that show the middles of objects."""
-        return project(self._from_middle, pixels)
-
-    def top_pixels(self, places: ArrayLike) -> np.ndarray:
-        """Return the working pixels (..., 2) of places of tops."""
-        return project(self.top, places)
-
-    def middle_pixels(self, places: ArrayLike) -> np.ndarray:
-        """Return the working pixels (..., 2) of the middles of objects at places."""
-        return project(self._middle, places)
+    def pixels(self, places: ArrayLike, height: float = TOP) -> np.ndarray:
+        """Return the working pixels (..., 2) of places at TOP, MIDDLE or 0."""
+        return _project(self.levels[height], places)
 
     def apart(self, other: 'Plane') -> float:
         """Return how far corners of the table are from those of another plane, working px."""
         corners = np.array([(x, y) for x in (-EDGE, EDGE) for y in (-EDGE, EDGE)])
-        return float(np.abs(self.top_pixels(corners) - other.top_pixels(corners)).max())
-
-    def rise(self, place: np.ndarray) -> np.ndarray:
-        """Return the working pixels (2,) from the table at a place up to a top; 0 if unknown."""
-        return project(self.top, place) - project(self._base, place)
-
-    def toward_camera(self, place: np.ndarray) -> np.ndarray:
-        """Return the direction (2,) on the table in which the sides of an object are seen."""
-        down = self.of_top(self.top_pixels(place) - self.rise(place)) - place
-        return down / max(float(np.linalg.norm(down)), 1e-9)
+        return float(np.abs(self.pixels(corners) - other.pixels(corners)).max())
 
 
 def check_pose(pose: np.ndarray) -> None:
@@ -103,7 +86,7 @@ def check_pose(pose: np.ndarray) -> None:
                 *pose[:3, 3], *pose[:3, 2]))
 
 
-def project(matrix: np.ndarray, points: ArrayLike) -> np.ndarray:
+def _project(matrix: np.ndarray, points: ArrayLike) -> np.ndarray:
     """Map points (..., 2) by a homography (3, 3)."""
     points = np.asarray(points, np.float64)
     rays = points @ matrix[:, :2].T + matrix[:, 2]

@@ -104,7 +104,7 @@ def _located(before: Picture, after: Picture,
     """Yield those masks of a picture that are found in another one, and where."""
     matcher = Matcher(after)
     for mask in masks:
-        place = before.plane.of_top(centre(mask))
+        place = before.plane.places(centre(mask))
         pose = matcher.locate(Template(before, mask, place, 0.0, top=True), extra=[place])
         if pose.confidence > SURE:
             yield mask, pose

@@ -16,7 +16,7 @@ from tap_ros.base.contract import HIDDEN, LOST, SEEN, UNSURE
 from tap_ros.base.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.picture import Picture
-from tap_ros.tracking.plane import EDGE, Plane, TOP
+from tap_ros.tracking.plane import EDGE, MIDDLE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.silhouette import apart, centre, clicked, Cut, share, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, SURE, Template
@@ -32,7 +32,6 @@ SHARED = 0.8  # of the part of an object that was known, in what is all of it
 UNSURELY = 0.8  # factor of the confidence in an object whose middle is not known
 WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
-RECURS = 0.6  # share of the colours of the first template in such a cut
 KEYS = 6  # templates of an object, the first among them
 KEPT = 0.1  # weight of places where a goal picture shows nothing else
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
@@ -116,8 +115,8 @@ class RigidTracker:
         plane, sure = picture.plane, cut.sure(at)
         # Of half an object, or two witnesses that contradict each other: half way.
         way = 0.0 if not self._snap else 1.0 if sure else 0.5
-        middle = plane.of_top(centre(top_face(cut.mask, plane)))
-        place = way * middle + (1 - way) * plane.of_middle(at)
+        middle = plane.places(centre(top_face(cut.mask, plane)))
+        place = way * middle + (1 - way) * plane.places(at, MIDDLE)
         first, face = (Template(picture.by(cut.metric), cut.mask, place, angle, top)
                        for top in (False, True))
         return _Object(place, [first], face, first, angle, sure=sure, part=not cut.whole)
@@ -145,12 +144,12 @@ class RigidTracker:
             found[best] = tried[best]
         poses, plane = [found[k] for k in range(len(faces))], self._plane
         confidence = np.array([pose.confidence for pose in poses])
-        pixels = np.array([plane.enlarge(plane.middle_pixels(pose.place)) if sure else (
-            np.nan, np.nan) for pose, sure in zip(poses, confidence > SURE)]).reshape(-1, 2)
+        places, sure = np.reshape([pose.place for pose in poses], (-1, 2)), confidence > SURE
         return Tracked(
-            pixels, tuple(SEEN if sure else LOST for sure in confidence > SURE), confidence,
-            tuple(plane.enlarge(self._outline(pose)) if sure else np.zeros((0, 2))
-                  for pose, sure in zip(poses, confidence > SURE)))
+            np.where(sure[:, None], plane.enlarge(plane.pixels(places, MIDDLE)), np.nan),
+            tuple(SEEN if one else LOST for one in sure), confidence,
+            tuple(plane.enlarge(self._outline(pose)) if one else np.zeros((0, 2))
+                  for pose, one in zip(poses, sure)))
 
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
@@ -185,21 +184,18 @@ class RigidTracker:
     def _search(self, one: _Object, matcher: Matcher, hand: np.ndarray | None) -> Pose:
         """Return the best pose near by, else anywhere."""
         grown = 1 + 0.5 * min(one.age, 4)
-        reach, turn, push = REACH * grown, TURN * min(grown, 2), np.zeros(2)
+        reach, turn, keys = REACH * grown, TURN * min(grown, 2), one.nearest()
+        others = [(key, one.place) for key in (*keys[1:2], one.face)]
         if hand is not None:
             near = (hand[:, 2] < HAND_HIGH) & (
                 np.linalg.norm(hand[:, :2] - one.place, axis=1) < HAND_FAR)
             if near.any():
-                push = hand[1, :2] - hand[0, :2]
+                others.append((keys[0], one.place + hand[1, :2] - hand[0, :2]))
             elif one.age == 0:
                 reach, turn = REST, REST_TURN
-        keys = one.nearest()
         best = matcher.refine(keys[0], one.place, one.angle, reach, turn)
         if best.fit > GOOD and best.cost < GOOD_COST:
             return best
-        others = [(key, one.place) for key in (*keys[1:2], one.face)]
-        if np.linalg.norm(push) > 0.01:
-            others.append((keys[0], one.place + push))
         for key, place in others:
             pose = matcher.refine(key, place, one.angle, reach, turn)
             if pose.cost < best.cost - 0.03:
@@ -241,15 +237,13 @@ class RigidTracker:
         if share(before, picture.hidden):
             return
         one.waits = WAITS
-        at, *others = self._plane.middle_pixels([one.place, *(
-            other.place for other in self._objects if other is not one)])
+        at, *others = self._plane.pixels([one.place, *(
+            other.place for other in self._objects if other is not one)], MIDDLE)
         radius = 1.4 * float(np.linalg.norm(outline - at, axis=1).max()) + 4
         cut = silhouette(picture, at, others, 0.0 if one.part else radius)
         if share(cut.mask, picture.hidden):
             return
-        if not one.part and 0.6 < cut.mask.sum() / one.keys[0].area < 1.6 and (
-                one.keys[0].palette.recurs(
-                    picture.index[cut.mask], one.keys[0].indices) > RECURS):
+        if not one.part and 0.6 < cut.mask.sum() / one.keys[0].area < 1.6:
             key = Template(picture, cut.mask, one.place, one.angle)
             one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
         elif one.part and cut.sure(at) and before[cut.mask].sum() > SHARED * before.sum():
@@ -259,11 +253,10 @@ class RigidTracker:
         """Return where the objects are."""
         places = np.array([one.place for one in self._objects]).reshape(-1, 2)
         return Tracked(
-            self._plane.enlarge(self._plane.middle_pixels(places)),
+            self._plane.enlarge(self._plane.pixels(places, MIDDLE)),
             tuple(one.state for one in self._objects),
             np.array([one.confidence * (1.0 if one.sure else UNSURELY) for one in self._objects]),
             tuple(self._plane.enlarge(self._outline(one)) for one in self._objects))
 
     def _outline(self, one: _Object | Pose) -> np.ndarray:
-        return self._plane.top_pixels(
-            one.template.placed(one.template.outline, one.place, one.angle))
+        return self._plane.pixels(one.template.placed(one.template.outline, one.place, one.angle))

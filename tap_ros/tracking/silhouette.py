@@ -206,7 +206,8 @@ def top_face(mask: np.ndarray, plane: Plane) -> np.ndarray:
     is all top.
     """
     top, at = mask.copy(), np.argwhere(mask)
-    rise = plane.rise(plane.of_top(centre(mask)))[::-1]
+    place = plane.places(centre(mask))
+    rise = (plane.pixels(place) - plane.pixels(place, 0.0))[::-1]  # 0 without a camera
     for share in np.linspace(0, 1, 9)[1:]:
         below = np.rint(at - share * rise).astype(int).clip(0, np.array(mask.shape) - 1)
         top[mask] &= mask[tuple(below.T)]

@@ -3,16 +3,17 @@
 """A rigid template of an object on the plane of the tops, searched in pictures."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from tap_ros.tracking.picture import NEAR, Palette, Picture
-from tap_ros.tracking.plane import EDGE
+from tap_ros.tracking.picture import Palette, Picture
+from tap_ros.tracking.plane import EDGE, MIDDLE, TOP
 from tap_ros.tracking.silhouette import top_face
 
 POINTS, RING = 120, 40  # of a template, inside and around
 FAR = 22  # distance of colours that counts as none
+NEAR = 15.4  # distance from a colour of an object below which it has that colour
 HIDDEN = 0.4  # cost of a point behind the robot: hiding there is no way out
 AROUND = 0.35  # weight of points beside the object that look like it
 SAME = 17.6  # distance below which a point has its own colour
@@ -26,9 +27,10 @@ ROUND = 0.06  # cost at the edge of the search: of two places alike the nearer o
 LEAST_FAR = 0.3  # share of an object that has to be seen
 PLACES, TRIED = 6, 4  # that are tried, and turns at each of them that are tried finely
 APART = 0.035  # m from other objects
-_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.5)
 _TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
-_AROUND = np.stack(np.meshgrid(*[np.linspace(-0.03, 0.03, 5)] * 2), -1).reshape(-1, 2)  # m
+# Of refine: places along x and y, turns, every so many points, and what the next level is of this.
+_LEVELS = ((7, 5, 2, 1 / 3.2, 1 / 2.5), (5, 5, 1, 1 / 3, 1 / 2.5), (5, 3, 1, 1 / 3, 1 / 2.5),
+           (3, 3, 1, 1 / 3, 1 / 2.5))
 # Of a pose's fit, cost and seen: logistic regression on 11,000 poses in simulated scenes, others
 # than those of docs/results/tracking.md.
 _BIAS, _FIT, _COST, _SEEN = 1.74, 3.25, 7.59, 2.55
@@ -56,29 +58,28 @@ class Template:
         self.palette = Palette(picture.lab[mask], self.metric)
         outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL,
                                        cv2.CHAIN_APPROX_TC89_L1)
-        self.outline = plane.of_top(max(outlines, key=len)[:, 0]) - place
+        self.outline = plane.places(max(outlines, key=len)[:, 0]) - place
         if plane.blur:  # pixels at its edge are mixed with the table
             inside = cv2.erode(part.astype(np.uint8), _round(2 * plane.blur + 1)) > 0
             part = inside if inside.sum() > 0.3 * part.sum() else part
         pixels = _draw(part, POINTS, rng)
-        self.points = (plane.of_top(pixels) - place).astype(np.float32)
+        self.points = (plane.places(pixels) - place).astype(np.float32)
         self.colours = np.pad(picture.lab[pixels[:, 1], pixels[:, 0]], ((0, 0), (0, 1)))
-        self.indices = picture.index[pixels[:, 1], pixels[:, 0]]
         inner, outer = (cv2.dilate(part.astype(np.uint8), _round(side + 4 * plane.blur))
                         for side in (5, 9))
         beside = _draw(outer > inner, RING, rng)
         near = self.palette.distance(picture.index[beside[:, 1], beside[:, 0]])
         self.contrast = float(np.median(near)) if len(near) else 0.0
         self.beside = float((near < NEAR).mean()) if len(near) else 0.0
-        self.normals: np.ndarray | None = None
+        self.outward: np.ndarray | None = None  # rad, of points around
         if plane.calibrated and top:  # sides of the object are beside it
             smooth = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 3)
             slope = -np.stack(np.gradient(smooth)[::-1], -1)[beside[:, 1], beside[:, 0]]
-            normals = plane.of_top(beside + slope) - plane.of_top(beside)
-            self.normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
+            out = plane.places(beside + slope) - plane.places(beside)
+            self.outward = np.arctan2(out[:, 1], out[:, 0])
         elif self.contrast <= CONTRAST:
             beside = beside[:0]
-        self.ring = (plane.of_top(beside) - place).astype(np.float32)
+        self.ring = (plane.places(beside) - place).astype(np.float32)
 
     def placed(self, points: np.ndarray, place: np.ndarray, angle: float) -> np.ndarray:
         """Return points (N, 2) m of the object at a place, turned from the first picture."""
@@ -90,13 +91,13 @@ class Template:
 class Pose:
     """Where a template was found; angle relative to the picture that it was cut from."""
 
-    place: np.ndarray  # (2,) m
-    angle: float  # rad
-    cost: float  # 0 to 1.35; inf: it was not found
-    seen: float  # share of the points that the robot does not hide
-    fit: float  # share of those that have colours of the object
-    alone: bool  # what is around does not look like the object, too
     template: Template
+    place: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))  # (2,) m
+    angle: float = 0.0  # rad
+    cost: float = np.inf  # 0 to 1.35; inf: it was not found
+    seen: float = 0.0  # share of the points that the robot does not hide
+    fit: float = 0.0  # share of those that have colours of the object
+    alone: bool = False  # what is around does not look like the object, too
 
     @property
     def confidence(self) -> float:
@@ -126,10 +127,10 @@ class Matcher:
         self._likeness: dict[Template, np.ndarray] = {}
 
     def likeness(self, template: Template) -> np.ndarray:
-        """Return how like the object's colours each pixel is, (h, w) 0 to 1, 0 where covered."""
+        """Return how like its colours each pixel is, flat: 0 to 1, 0 if covered or beside."""
         if template not in self._likeness:
             like = 1 - template.palette.distance(self.picture.index) / FAR
-            self._likeness[template] = np.maximum(like, 0) * ~self.covered
+            self._likeness[template] = np.append(like.clip(0) * ~self.covered, np.float32(0))
         return self._likeness[template]
 
     def score(self, template: Template, places: np.ndarray, angles: np.ndarray,
@@ -143,17 +144,17 @@ class Matcher:
         """
         apart, free = self._apart(template, self._look(template.points[::thin], places, angles),
                                   thin)
-        seen = _mean(free)
-        cost = _mean(np.minimum(apart, FAR)) / FAR + (HIDDEN - 1) * (1 - seen)
+        seen = free.mean(-1)
+        cost = np.minimum(apart, FAR).mean(-1) / FAR + (HIDDEN - 1) * (1 - seen)
         if len(template.ring):
-            like, free = self._like(template, self._look(template.ring[::thin], places, angles))
-            if template.normals is not None:
-                toward = self.picture.plane.toward_camera(places.mean(0))
-                c, s = np.cos(angles), np.sin(angles)
-                turned = np.stack([c * toward[0] + s * toward[1], c * toward[1] - s * toward[0]])
-                away = (template.normals[::thin] @ turned).T < 0.2  # (A, R)
+            index = self._look(template.ring[::thin], places, angles)
+            like, free = self.likeness(template).take(index), self._words.take(index) >= 0
+            if template.outward is not None:
+                x, y = self.picture.plane.eye - places.mean(0)
+                away = np.cos(template.outward[::thin] + angles[:, None]
+                              - np.arctan2(y, x)) < 0.2  # (A, R)
                 like, free = like * away[:, None], free & away[:, None]
-            cost += AROUND * _mean(like) / np.maximum(_mean(free), 1e-3)
+            cost += AROUND * like.mean(-1) / np.maximum(free.mean(-1), 1e-3)
         return cost, seen
 
     def fit(self, template: Template, place: np.ndarray, angle: float) -> tuple[float, bool]:
@@ -165,8 +166,9 @@ class Matcher:
         if same.sum() <= LEAST_SAME * known:
             return 0.0, False
         # other sides show as it turns: any of its colours fits
-        own = self._like(template, index)[0] > 1 - NEAR / FAR
-        beside = self._like(template, self._look(template.ring, place[None], turned))[0]
+        like = self.likeness(template)
+        own = like.take(index) > 1 - NEAR / FAR
+        beside = like.take(self._look(template.ring, place[None], turned))
         # where the camera is known only planks of its colour were beside it, and no other object
         alone = self.picture.plane.calibrated or not beside.size or (
             (beside > 1 - NEAR / FAR).mean() <= template.beside + MERGED)
@@ -181,11 +183,6 @@ class Matcher:
         sums = apart.reshape(-1, 4).astype(np.float32) @ np.ones(4, np.float32)
         return sums.reshape(index.shape), words >= 0
 
-    def _like(self, template: Template, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how like the object's colours pixels are, 0 where covered; and which are seen."""
-        free = self._words.take(index) >= 0
-        return self.likeness(template).take(index, mode='clip') * free, free
-
     def _look(self, points: np.ndarray, places: np.ndarray, angles: np.ndarray) -> np.ndarray:
         """Return the flat pixels (A, S, P) of points (P, 2) of a template at all poses."""
         h, w = self.picture.size
@@ -194,7 +191,7 @@ class Matcher:
         X, Y = np.outer(c, x) - np.outer(s, y), np.outer(s, x) + np.outer(c, y)  # (A, P)
         u, v, scale = (np.add((across * X + down * Y)[:, None].astype(np.float32),
                               (places @ (across, down) + still)[None, :, None].astype(np.float32))
-                       for across, down, still in self.picture.plane.top)
+                       for across, down, still in self.picture.plane.levels[TOP])
         u, v = (np.floor(ray / scale + np.float32(0.5)).astype(np.int32) for ray in (u, v))
         return np.where((u < 0) | (u >= w) | (v < 0) | (v >= h), h * w, v * w + u)
 
@@ -209,18 +206,19 @@ class Matcher:
         :return: the best Pose, its angle relative to the first picture; its cost may be inf.
         """
         best, turned, wide = place, angle - template.angle, reach
-        for line, turns, thin, next_reach, next_turn in _LEVELS:
-            places, angles = best + reach * line, turned + turn * turns
+        for count, turns, thin, next_reach, next_turn in _LEVELS:
+            places = best + _grid(reach, count)
+            angles = turned + turn * np.linspace(-1, 1, turns)
             cost, seen = self.score(template, places, angles, thin)
             total = cost + pull * (((places - place) / wide) ** 2).sum(1)
             total[seen < LEAST_SEEN] = np.inf
             i, j = np.unravel_index(total.argmin(), total.shape)
             if not np.isfinite(total[i, j]):
-                return _nowhere(template)
+                return Pose(template)
             best, turned = places[j], float(angles[i])
             reach, turn = reach * next_reach, turn * next_turn
-        return Pose(best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
-                    *self.fit(template, best, turned), template)
+        return Pose(template, best, turned + template.angle, float(cost[i, j]), float(seen[i, j]),
+                    *self.fit(template, best, turned))
 
     def locate(self, template: Template, avoid: Sequence[np.ndarray] = (),
                region: np.ndarray | float = 1.0, extra: Sequence[np.ndarray] = ()) -> Pose:
@@ -232,20 +230,21 @@ class Matcher:
         :param extra: places that are tried, too.
         """
         plane, side = self.picture.plane, max(5.0, template.area ** 0.5)
-        dense = cv2.GaussianBlur(self.likeness(template), (0, 0), side / 2.5) * region
+        like = self.likeness(template)[:-1].reshape(self.picture.size)
+        dense = cv2.GaussianBlur(like, (0, 0), side / 2.5) * region
         peaks = []
         for _ in range(PLACES):
             v, u = np.unravel_index(dense.argmax(), dense.shape)
             if dense[v, u] <= 0.01:
                 break
-            peaks.append(plane.of_top((u, v)))
+            peaks.append(plane.places((u, v)))
             cv2.circle(dense, (int(u), int(v)), int(side * 0.7), 0, -1)
-        best = _nowhere(template)
+        best = Pose(template)
         for place in (*peaks, *extra):
             if (plane.calibrated and (np.abs(place) > EDGE).any()
                     or any(np.linalg.norm(place - other) < APART for other in avoid)):
                 continue
-            places = place + _AROUND
+            places = place + _grid(0.03, 5)
             cost, seen = self.score(template, places, _TURNS, thin=3)
             cost[seen < LEAST_FAR] = np.inf
             for i in cost.min(1).argsort()[:TRIED]:
@@ -262,24 +261,15 @@ class Matcher:
         :return: (2,) the place where they are densest near by; and how much of them is there, as
             a share of the object's own area.
         """
-        like, plane = self.likeness(template), self.picture.plane
-        h, w = like.shape
+        plane, (h, w) = self.picture.plane, self.picture.size
+        like = self.likeness(template)[:-1].reshape(h, w)
         half = min(max(6, round(template.area ** 0.5 * 0.6)), h // 2, w // 2)
-        u, v = (plane.top_pixels(place) - half).clip(0, (w - 2 * half, h - 2 * half)).astype(int)
+        corner = plane.pixels(place, MIDDLE) - half
+        u, v = corner.clip(0, (w - 2 * half, h - 2 * half)).astype(int)
         _, (u, v, width, height) = cv2.meanShift(
-            (255 * like).astype(np.uint8), (u, v, 2 * half, 2 * half), _STOP)
+            (255 * like).astype(np.uint8), (u, v, 2 * half, 2 * half), (3, 15, 0.5))
         amount = float(like[v:v + height, u:u + width].sum()) / template.area
-        return plane.of_top((u + half, v + half)), amount
-
-
-def _nowhere(template: Template) -> Pose:
-    return Pose(np.full(2, np.nan), 0.0, np.inf, 0.0, 0.0, False, template)
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Return the mean over the last axis, faster than numpy does."""
-    P = values.shape[-1]
-    return values.astype(np.float32) @ np.full(P, 1 / P, np.float32)
+        return plane.places((u + half, v + half), MIDDLE), amount
 
 
 def _round(side: int) -> np.ndarray:
@@ -291,13 +281,7 @@ def _draw(mask: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     return rng.permutation(np.argwhere(mask)[:, ::-1])[:count]
 
 
-def _square(count: int) -> np.ndarray:
-    line = np.linspace(-1, 1, count)
+def _grid(reach: float, count: int) -> np.ndarray:
+    """Return places (count * count, 2) around the origin, m."""
+    line = reach * np.linspace(-1, 1, count)
     return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
-
-
-# Of refine: places, turns, every so many points, and what the next level is of this one.
-_LEVELS = ((_square(7), np.linspace(-1, 1, 5), 2, 1 / 3.2, 1 / 2.5),
-           (_square(5), np.linspace(-1, 1, 5), 1, 1 / 3, 1 / 2.5),
-           (_square(5), np.linspace(-1, 1, 3), 1, 1 / 3, 1 / 2.5),
-           (_square(3), np.linspace(-1, 1, 3), 1, 1 / 3, 1 / 2.5))
