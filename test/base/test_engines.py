@@ -109,7 +109,7 @@ def test_ray_gives_what_the_pool_gives_also_when_a_node_dies(tmp_path, monkeypat
 
 @pytest.mark.parametrize('program, chosen, threads', [
     ('/any/bin/predictor_node', None, '1'), ('/any/bin/predictor_node', '3', '3'),
-    ('/any/bin/mine', None, 'None')])
+    ('/any/experiments/__main__.py', None, '1'), ('/any/bin/mine', None, 'None')])
 def test_each_of_our_programs_has_one_thread_unless_the_user_chose(program, chosen, threads):
     variables = {key: value for key, value in os.environ.items() if key != 'OMP_NUM_THREADS'}
     code = (f'import os, sys; sys.argv = [{program!r}]; import tap_ros; '
