@@ -11,6 +11,7 @@ from tap_ros.tracking.protocols import View
 
 SQUARE = np.ones((3, 3), np.uint8)  # what a mask is grown or shrunk by
 FEW = 4  # colours of a Palette, at most
+NEAR = 15.4  # distance from a colour of an object below which it has that colour
 CHANGED = 8.0  # distance of colours that differ
 TONE = 0.03  # of the light or of a channel, from which on a change is taken back
 DARK, BRIGHT = 12, 243  # levels between which a change of light shows
@@ -114,9 +115,17 @@ class Palette:
                 cv2.KMEANS_PP_CENTERS)
             shares = np.bincount(np.ravel(labels), minlength=FEW) / len(labels)
             centres = np.asarray(found)[shares >= min(least, shares.max())]
-        self._table = np.min([sum(np.abs(axis - value) for axis, value in zip(
-            metric.axes, centre)).ravel() for centre in centres], 0)
+        self._far = np.array([sum(np.abs(axis - value) for axis, value in zip(
+            metric.axes, centre)).ravel() for centre in centres])
+        self._table = self._far.min(0)
 
     def distance(self, index: np.ndarray) -> np.ndarray:
         """Return the distances of colours by their index, any shape, float32."""
         return self._table.take(index)
+
+    def recurs(self, index: np.ndarray, wanted: np.ndarray) -> float:
+        """Return how alike the shares of each colour are of some colours and of wanted ones."""
+        near = (self._far[:, index] < NEAR).mean(1)  # shades of one stand for another
+        nearest = self._far[:, wanted].argmin(0)
+        return float(np.minimum(near, np.bincount(nearest, minlength=len(near)) / len(
+            wanted)).sum())

@@ -32,6 +32,7 @@ SHARED = 0.8  # of the part of an object that was known, in what is all of it
 UNSURELY = 0.8  # factor of the confidence in an object whose middle is not known
 WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
+RECURS = 0.6  # share of the colours of the first template in such a cut
 KEYS = 6  # templates of an object, the first among them
 KEPT = 0.1  # weight of places where a goal picture shows nothing else
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
@@ -243,7 +244,9 @@ class RigidTracker:
         cut = silhouette(picture, at, others, 0.0 if one.part else radius)
         if share(cut.mask, picture.hidden):
             return
-        if not one.part and 0.6 < cut.mask.sum() / one.keys[0].area < 1.6:
+        if not one.part and 0.6 < cut.mask.sum() / one.keys[0].area < 1.6 and (
+                one.keys[0].palette.recurs(
+                    picture.index[cut.mask], one.keys[0].indices) > RECURS):
             key = Template(picture, cut.mask, one.place, one.angle)
             one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
         elif one.part and cut.sure(at) and before[cut.mask].sum() > SHARED * before.sum():

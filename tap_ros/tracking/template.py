@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from tap_ros.tracking.picture import Palette, Picture
+from tap_ros.tracking.picture import NEAR, Palette, Picture
 from tap_ros.tracking.plane import EDGE, MIDDLE, TOP
 from tap_ros.tracking.silhouette import top_face
 
 POINTS, RING = 120, 40  # of a template, inside and around
 FAR = 22  # distance of colours that counts as none
-NEAR = 15.4  # distance from a colour of an object below which it has that colour
 HIDDEN = 0.4  # cost of a point behind the robot: hiding there is no way out
 AROUND = 0.35  # weight of points beside the object that look like it
 SAME = 17.6  # distance below which a point has its own colour
@@ -65,6 +64,7 @@ class Template:
         pixels = _draw(part, POINTS, rng)
         self.points = (plane.places(pixels) - place).astype(np.float32)
         self.colours = np.pad(picture.lab[pixels[:, 1], pixels[:, 0]], ((0, 0), (0, 1)))
+        self.indices = picture.index[pixels[:, 1], pixels[:, 0]]
         inner, outer = (cv2.dilate(part.astype(np.uint8), _round(side + 4 * plane.blur))
                         for side in (5, 9))
         beside = _draw(outer > inner, RING, rng)
