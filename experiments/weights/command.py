@@ -25,7 +25,8 @@ SHIPPED = {
     'grasp': ('grasp', {'grasp': {'episodes': 3000},
                         'grasp_more': {'episodes': 3000, 'seed': 100_000}}),
     'grasp_forward': ('grasp', {'grasp': {'episodes': 3000}}),
-    'pick_place': ('pick_place', {'pick_place': {'episodes': 3000}}),
+    'pick_place': ('pick_place', {'pick_place': {'episodes': 3000},
+                                  'pick_place_more': {'episodes': 4000, 'seed': 100_000}}),
     'pick_place_vae': ('pick_place', {'pick_place': {'episodes': 3000}})}
 
 
