@@ -98,7 +98,7 @@ def run(options: Options) -> None:
               for i, those in marks.episodes.items()}
     names = marks.names or tuple(
         f'mark {k + 1}' for k in range(len(next(iter(marked.values()), ()))))
-    labels = label(films, marked, names)
+    labels = label(films, marked, names, progress=True)
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
     places = numbered(store, options.recordings, out)

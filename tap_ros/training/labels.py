@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.base.errors import ConfigError
+from tap_ros.base.progress import Progress
 from tap_ros.base.text import listing
 from tap_ros.training.preference import describe, FEATURES, LEAST_FRAMES
 
@@ -242,12 +243,13 @@ def moments_of(one: Film, log_posterior: np.ndarray) -> tuple[np.ndarray, np.nda
     return one.stamps[best], mass[0, np.arange(len(best)), best].clip(0, 1)
 
 
-def fit(films: Sequence[Film],
-        moments: Sequence[np.ndarray]) -> tuple[MomentModel | Average, list[np.ndarray]]:
+def fit(films: Sequence[Film], moments: Sequence[np.ndarray],
+        progress: bool = False) -> tuple[MomentModel | Average, list[np.ndarray]]:
     """
     Learn models from marks, and from all marks but those of each fold, to weigh them.
 
     :param films: that were marked; moments: of each (M,) s.
+    :param progress: show a bar.
     :return: the average, and of each what the others make of it, see Labels.left_out.
     :raises ConfigError: see MomentModel.
     """
@@ -256,7 +258,8 @@ def fit(films: Sequence[Film],
     kinds = list(product((*GREY, *(-one for one in PLAIN_GREY)), REACH_S))
     models = [MomentModel(films, moments, *kind) for kind in kinds]
     worth, folds = np.empty((len(models), len(films))), list[list[MomentModel]]()
-    for first in range(min(FOLDS, len(films))):
+    for first in Progress(range(min(FOLDS, len(films))), 'learning from marks',
+                          disable=not progress, delay=1):
         rest = [i for i in range(len(films)) if i % FOLDS != first]
         marked = [films[i] for i in rest], [moments[i] for i in rest]
         folds.append([MomentModel(*marked, *kind, like) for kind, like in zip(kinds, models)])
@@ -272,19 +275,21 @@ def fit(films: Sequence[Film],
 
 
 def label(films: Sequence[Film | None], marked: Mapping[int, np.ndarray],
-          names: Sequence[str]) -> Labels:
+          names: Sequence[str], progress: bool = False) -> Labels:
     """
     Find the moments of all demonstrations.
 
     :param films: of each demonstration its Film; None of one that is too short to be marked.
     :param marked: {demonstration: moments (M,) s}.
     :param names: of the M marks.
+    :param progress: show a bar.
     :raises ConfigError: see MomentModel; for as many names as there are not marks.
     """
     if any(len(moments) != len(names) for moments in marked.values()):
         raise ConfigError(f'marks: expected {len(names)} in each demonstration, '
                           f'{listing(names)}, got {sorted({*map(len, marked.values())})}')
-    model, left_out = fit([film for i in marked if (film := films[i])], list(marked.values()))
+    model, left_out = fit([film for i in marked if (film := films[i])], list(marked.values()),
+                          progress)
     found = Labels(tuple(names), [], [], left_out)
     for i, one in enumerate(films):
         moments, confidence = np.full((2, len(names)), math.nan)

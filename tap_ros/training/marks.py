@@ -29,11 +29,12 @@ LEAST = 1e-37  # w of the others; its logarithm is finite, so that some target i
 
 def episode_preferences(
         store: 'EpisodeStore', config: 'TrainingConfig', training: np.ndarray,
-) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
+        progress: bool = False) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
     """
     Compute the preference w(t) that a training needs, by stillness or from marks.
 
     :param training: indices of the episodes to train on.
+    :param progress: show a bar.
     :return: w of each episode, float32 (levels, T), 1 in those too short for targets; None if it
         follows from the time. And what the weights file tells of the marks.
     :raises ConfigError: see label_episodes.
@@ -52,7 +53,7 @@ def episode_preferences(
         # What the cut leaves out may tell the moment.
         whole = open_recordings(bags_of(config), progress=False, reading=replace(
             reading_of(config), crop='whole', size=SIZE))
-    labels, levels = label_episodes(whole, marks, training, config)
+    labels, levels = label_episodes(whole, marks, training, config, progress)
     for w, label in zip(found, labels):
         if label is not None:
             w[:] = label
@@ -67,12 +68,13 @@ def hidden_of(store: 'EpisodeStore', i: int, robot_mask: RobotMask) -> np.ndarra
 
 
 def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
-                   config: 'TrainingConfig',
+                   config: 'TrainingConfig', progress: bool = False,
                    ) -> tuple[list[np.ndarray | None], list[dict[str, Any]]]:
     """
     Find how likely each frame is the one that is marked, by the marks of the training episodes.
 
     :param training: indices of the episodes to train on; marks of others are left out.
+    :param progress: show a bar.
     :return: of each episode w of its frames, (levels, T), 1 at the likeliest one, LEAST beyond the
         LIKELIEST; None for one too short. And of each level how well a mark is found by what is
         learned from the others. Predictions between start and goal begin with the last mark, those
@@ -104,7 +106,7 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
         store[i].stamps[(first + last) // 2] - store[i].stamps[0]
         for first, last in marks.episodes[i]]) / 1e9 for i in chosen}
     of_chosen = [one for i in chosen if (one := films[i])]
-    model, left_out = fit(of_chosen, list(moments.values()))
+    model, left_out = fit(of_chosen, list(moments.values()), progress)
     about = [_worth(of_chosen, np.array(true), np.array(guess)) for true, guess in zip(
         np.transpose(list(moments.values())),
         np.transpose(left_out) if left_out else [()] * count)][order]

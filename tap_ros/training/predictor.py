@@ -57,7 +57,8 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
         if config.patience and not len(run.held_out):
             raise ConfigError('patience: nothing is held out to see improvement by; give '
                               '--held-out, a --test-fraction above 0, or leave --patience out')
-        preference, run.about = episode_preferences(run.store, config, run.training)
+        preference, run.about = episode_preferences(
+            run.store, config, run.training, progress)
         network, helpers = make_networks(run)
         filled = None if config.robot_mask == 'none' else FilledStore(
             run.store, config.robot_mask, progress)
