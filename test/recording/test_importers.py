@@ -183,7 +183,7 @@ def test_an_import_that_is_ended_leaves_nothing_in_the_way_of_the_next(tmp_path,
     set_, bag = tmp_path / 'set', tmp_path / 'bag'
     set_.mkdir()
     for k in range(30):
-        write_video(set_ / f'{k:02}.avi', make_frames(k, 40, 128), 10)
+        write_video(set_ / f'{k:02}.avi', make_frames(k, 40, 256), 10)
     command = [sys.executable, '-m', 'tap_ros', 'import-video', str(set_), '--out', str(bag)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     while not any(bag.glob('*.mcap*')) and process.poll() is None:
