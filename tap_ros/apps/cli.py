@@ -90,6 +90,9 @@ def main(line: CommandLine, arguments: Sequence[str] | None = None) -> int:
                    'yours and not full')
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
+        # After one that left an exec(), as in making a dataclass, Python ends by SIGINT though it
+        # was caught; the next exec() makes it forget that.
+        exec('')
         return 130
     print(f'error: {message}', file=sys.stderr)
     return 1

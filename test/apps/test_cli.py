@@ -109,3 +109,27 @@ def test_a_missing_package_is_named_and_others_are_not_hidden(
     assert 'pip install pyarrow' in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
         main(['nosuch'])
+
+
+ENDED = """
+from dataclasses import dataclass
+import sys
+from tap_ros.apps.cli import Command, CommandLine, main
+
+@dataclass
+class Options:
+    '''Options.'''
+
+def run(options):
+    exec('raise KeyboardInterrupt')
+
+LINE = CommandLine('ended', 'End.', dict.fromkeys(
+    ('now', 'then'), ('end', lambda: Command(Options, run))))
+sys.exit(main(LINE, ['now']))
+"""
+
+
+def test_an_interrupt_that_leaves_an_exec_ends_a_command_as_any_other(tmp_path):
+    (tmp_path / 'ended.py').write_text(ENDED)
+    run = subprocess.run([sys.executable, '-m', 'ended'], cwd=tmp_path, capture_output=True)
+    assert (run.returncode, run.stderr) == (130, b'interrupted\n')
