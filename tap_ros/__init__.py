@@ -20,10 +20,9 @@ __version__ = VERSION
 # themselves as soon as they run.
 if sys.argv[:1] == ['-m']:
     _program = sys.orig_argv[sys.orig_argv.index('-m') + 1] if '-m' in sys.orig_argv else ''
-    _ours = _program.partition('.')[0] in ('tap_ros', 'sim_bridge')
-else:  # lib/tap_ros/sim_node; modules of experiments run by -m have their file there by now
-    _folder, _name = os.path.split(sys.argv[0])
-    _ours = _name in NODE_CLASSES or os.path.basename(_folder) == 'experiments'
+    _ours = _program.partition('.')[0] in ('tap_ros', 'sim_bridge', 'experiments')
+else:
+    _ours = os.path.basename(sys.argv[0]) in NODE_CLASSES  # lib/tap_ros/sim_node
 if _ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, leave_at_once)
 

@@ -37,6 +37,7 @@ class Plane:
         self.blur = round(scale / 2) if scale > 1.5 else 0
         self._scale = np.array([self.working[1] / width, self.working[0] / height])
         self.levels = {z: self._homography(camera, z) for z in (TOP, MIDDLE, 0.0)}
+        self._inverse = {z: np.linalg.inv(level) for z, level in self.levels.items()}
         self.eye = np.zeros(2) if camera is None else camera.pose[:2, 3]
 
     def _homography(self, camera: PinholeCamera | None, height: float) -> np.ndarray:
@@ -59,7 +60,7 @@ class Plane:
 
     def places(self, pixels: ArrayLike, height: float = TOP) -> np.ndarray:
         """Return the places (..., 2) that working pixels show, of TOP, MIDDLE or 0."""
-        return _project(np.linalg.inv(self.levels[height]), pixels)
+        return _project(self._inverse[height], pixels)
 
     def pixels(self, places: ArrayLike, height: float = TOP) -> np.ndarray:
         """Return the working pixels (..., 2) of places at TOP, MIDDLE or 0."""

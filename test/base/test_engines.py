@@ -109,7 +109,7 @@ def test_ray_gives_what_the_pool_gives_also_when_a_node_dies(tmp_path, monkeypat
 
 @pytest.mark.parametrize('program, chosen, threads', [
     ('/any/bin/predictor_node', None, '1'), ('/any/bin/predictor_node', '3', '3'),
-    ('/any/experiments/__main__.py', None, '1'), ('/any/bin/mine', None, 'None')])
+    ('/any/experiments/mine.py', None, 'None'), ('/any/bin/mine', None, 'None')])
 def test_each_of_our_programs_has_one_thread_unless_the_user_chose(program, chosen, threads):
     variables = {key: value for key, value in os.environ.items() if key != 'OMP_NUM_THREADS'}
     code = (f'import os, sys; sys.argv = [{program!r}]; import tap_ros; '
@@ -118,3 +118,19 @@ def test_each_of_our_programs_has_one_thread_unless_the_user_chose(program, chos
         [sys.executable, '-c', code], capture_output=True, text=True, cwd=ROOT,
         env=variables | ({'OMP_NUM_THREADS': chosen} if chosen else {}))
     assert said.stdout.strip() == threads, said.stderr
+
+
+def test_experiments_have_one_thread_from_their_first_import():
+    variables = {key: value for key, value in os.environ.items() if key != 'OMP_NUM_THREADS'}
+    said = subprocess.run(
+        [sys.executable, '-c', ENTERED], capture_output=True, text=True, cwd=ROOT, env=variables)
+    assert said.stdout.split() == ['1', 'False'], said.stderr
+
+
+# What `python -m experiments` imports before its module is run: the package alone.
+ENTERED = """
+import os, sys
+sys.argv, sys.orig_argv = ['-m'], ['python', '-m', 'experiments']
+import experiments
+print(os.environ.get('OMP_NUM_THREADS'), 'numpy' in sys.modules)
+"""
