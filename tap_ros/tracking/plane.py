@@ -18,14 +18,14 @@ class Plane:
     """
     The geometry of pictures of one size.
 
-    Places are metres in the frame of the table; without a camera, pixels of the working picture
-    over PIXELS_A_METRE.
+    Places (..., 3) are metres in the frame of the table: x, y, and how far an object was lifted;
+    without a camera, pixels of the working picture over PIXELS_A_METRE, and 0.
 
     :param camera: PinholeCamera in the frame of the table, or None.
     :param size: (height, width) of the pictures.
     :ivar working: (height, width) of the working picture.
     :ivar blur: px of it that an edge is wide at most, where it is enlarged.
-    :ivar levels: (3, 3) homographies of places at TOP, MIDDLE and 0 to working pixels.
+    :ivar matrix: (3, 4) projection of places to working pixels, lifted from the table's top.
     :ivar eye: (2,) m, the place that the camera is above.
     """
 
@@ -36,19 +36,19 @@ class Plane:
         self.working = max(round(height * scale), 1), max(round(width * scale), 1)
         self.blur = round(scale / 2) if scale > 1.5 else 0
         self._scale = np.array([self.working[1] / width, self.working[0] / height])
-        self.levels = {z: self._homography(camera, z) for z in (TOP, MIDDLE, 0.0)}
-        self._inverse = {z: np.linalg.inv(level) for z, level in self.levels.items()}
+        self.matrix = self._projection(camera)
+        self._inverse = {height: np.linalg.inv(np.column_stack([
+            self.matrix[:, :2], self.matrix @ (0, 0, height, 1)])) for height in (
+                TOP, MIDDLE, 0.0)}
         self.eye = np.zeros(2) if camera is None else camera.pose[:2, 3]
 
-    def _homography(self, camera: PinholeCamera | None, height: float) -> np.ndarray:
-        """Return the homography of a level plane to the working picture."""
+    def _projection(self, camera: PinholeCamera | None) -> np.ndarray:
         if camera is None:
-            return np.diag([PIXELS_A_METRE, -PIXELS_A_METRE, 1.0])
+            return np.diag([PIXELS_A_METRE, -PIXELS_A_METRE, 0.0, 1.0])[[0, 1, 3]]
         u, v = np.divide(self.working, camera.size)[::-1]
         K = np.array([[u, 0, u / 2 - 0.5], [0, v, v / 2 - 0.5], [0, 0, 1]]) @ camera.K
-        seen = np.linalg.inv(camera.pose)[:3]
-        matrix = K @ np.column_stack([seen[:, 0], seen[:, 1], seen[:, 2] * height + seen[:, 3]])
-        return matrix / matrix[2, 2]
+        matrix = K @ np.linalg.inv(camera.pose)[:3]
+        return np.asarray(matrix / matrix[2, 3])
 
     def shrink(self, pixels: ArrayLike) -> np.ndarray:
         """Return camera pixels (..., 2) in the working picture."""
@@ -59,16 +59,18 @@ class Plane:
         return (np.asarray(pixels, np.float64) + 0.5) / self._scale - 0.5
 
     def places(self, pixels: ArrayLike, height: float = TOP) -> np.ndarray:
-        """Return the places (..., 2) that working pixels show, of TOP, MIDDLE or 0."""
-        return _project(self._inverse[height], pixels)
+        """Return the places (..., 3), not lifted, that pixels show of TOP, MIDDLE or 0."""
+        rays = _homogeneous(pixels) @ self._inverse[height].T
+        return np.append(rays[..., :2] / rays[..., 2:], 0 * rays[..., 2:], -1)
 
     def pixels(self, places: ArrayLike, height: float = TOP) -> np.ndarray:
-        """Return the working pixels (..., 2) of places at TOP, MIDDLE or 0."""
-        return _project(self.levels[height], places)
+        """Return the working pixels (..., 2) of places at a height, m above their lift."""
+        rays = _homogeneous(places + np.array([0, 0, height])) @ self.matrix.T
+        return np.asarray(rays[..., :2] / rays[..., 2:])
 
     def apart(self, other: 'Plane') -> float:
         """Return how far corners of the table are from those of another plane, working px."""
-        corners = np.array([(x, y) for x in (-EDGE, EDGE) for y in (-EDGE, EDGE)])
+        corners = np.array([(x, y, 0) for x in (-EDGE, EDGE) for y in (-EDGE, EDGE)])
         return float(np.abs(self.pixels(corners) - other.pixels(corners)).max())
 
 
@@ -87,8 +89,7 @@ def check_pose(pose: np.ndarray) -> None:
                 *pose[:3, 3], *pose[:3, 2]))
 
 
-def _project(matrix: np.ndarray, points: ArrayLike) -> np.ndarray:
-    """Map points (..., 2) by a homography (3, 3)."""
+def _homogeneous(points: ArrayLike) -> np.ndarray:
+    """Return points (..., N) with a 1 behind."""
     points = np.asarray(points, np.float64)
-    rays = points @ matrix[:, :2].T + matrix[:, 2]
-    return rays[..., :2] / rays[..., 2:]
+    return np.append(points, np.ones((*points.shape[:-1], 1)), -1)

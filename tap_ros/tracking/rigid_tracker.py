@@ -1,14 +1,16 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The tracker of this package: clicked objects, followed as rigid bodies that slide on the table.
+The tracker of this package: clicked objects, followed as rigid bodies.
 
-No learned weights. Each picture is searched around the last pose of each object; what the robot
-hides stays where it was; what was not found near by is searched everywhere.
+No learned weights. Each picture is searched around the last pose of each object, on the table or
+as high as the hand has lifted it, where camera and hand are known. What the robot hides stays
+where it was; what was not found near by is searched everywhere.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -19,13 +21,17 @@ from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import EDGE, MIDDLE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.silhouette import apart, centre, clicked, Cut, share, silhouette, top_face
-from tap_ros.tracking.template import Matcher, Pose, SURE, Template
+from tap_ros.tracking.template import APART, Matcher, Pose, SURE, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
 REST, REST_TURN = 0.012, 0.1  # the same, of what the hand is not near to
+CARRIED, CARRIED_TURN = 0.03, 0.3  # of what may be carried, from where the hand is
 HAND_FAR, HAND_HIGH = 0.22, 0.1  # m: a hand farther off, or higher, moves nothing
 HAND_HALF = 0.02  # m, half as wide as the fingers are
+LIFTED = 0.01  # m, from where on it is above the table
+HELD = 0.04  # m from the hand to what it holds
 GOOD, GOOD_COST = 0.7, 0.35  # fit of what is believed; cost up to which no other is tried
+CLEARER = 0.03  # less cost of another than the likeliest pose
 MOST_COST = 0.4  # of what is found far from where it was
 NEW_COST, NEW_ANGLE, NEW_SEEN = 0.25, 0.35, 0.85  # from when on the object is cut out anew
 SHARED = 0.8  # of the part of an object that was known, in what is all of it
@@ -46,7 +52,7 @@ PATIENCE = 2  # pictures in which what should be seen may be missed, before it i
 class _Object:
     """What is known of one object."""
 
-    place: np.ndarray  # (2,) m
+    place: np.ndarray  # (3,) m
     keys: list[Template]  # the first one, and later ones that show other sides
     face: Template  # of its top alone, which looks alike from all sides
     template: Template  # that it was seen by last
@@ -68,16 +74,24 @@ class _Object:
         return float(np.abs(np.angle(np.exp(1j * (self.angle - key.angle)))))
 
     def pushed(self, hand: np.ndarray) -> np.ndarray:
-        """Return how far (2,) m the hand has moved it while nobody saw it."""
+        """Return where (3,) m the hand (2, 3), before and now, has pushed it on the table."""
         way = hand[1, :2] - hand[0, :2]
         length = float(np.linalg.norm(way))
         if hand[:, 2].max() > TOP or not length:
-            return np.zeros(2)
+            return self.place
         along, aside = way / length, np.array([-way[1], way[0]]) / length
-        points = self.face.placed(self.face.points, self.place, self.angle) - hand[1, :2]
+        points = self.face.placed(self.face.points, self.place, self.angle)[:, :2] - hand[1, :2]
         met = points[np.abs(points @ aside) < HAND_HALF] @ along
         met = met[met > -length - HAND_HALF]  # what is behind the hand stays there
-        return along * np.clip(HAND_HALF - met.min(initial=HAND_HALF), 0, length)
+        far = np.clip(HAND_HALF - met.min(initial=HAND_HALF), 0, length)
+        return self.place + np.append(along * far, 0)
+
+    def carried(self, hand: np.ndarray) -> list[np.ndarray]:
+        """Return where (3,) m it is above the table if the hand (2, 3) holds it, else nothing."""
+        off = self.face.placed(self.face.points, self.place, self.angle) - hand[0]
+        held = np.linalg.norm(off[:, :2], axis=1).min() < HELD and off[0, 2] > -TOP
+        place = self.place + hand[1] - hand[0]
+        return [place] if held and place[2] > LIFTED else []
 
 
 class RigidTracker:
@@ -104,7 +118,7 @@ class RigidTracker:
             for k, click in enumerate(clicks)])
         objects = [self._object(picture, *one) for one in zip(cuts, clicks)]
         for one, name in zip(objects, names):
-            if plane.calibrated and not (np.abs(one.place) < EDGE).all():
+            if plane.calibrated and not (np.abs(one.place[:2]) < EDGE).all():
                 raise TrackingError(f'{name} is on nothing within {EDGE:g} m of the middle of the '
                                     'table, along x and y; click on an object')
         self._objects, self._plane, self._first = objects, plane, picture
@@ -145,7 +159,7 @@ class RigidTracker:
             found[best] = tried[best]
         poses, plane = [found[k] for k in range(len(faces))], self._plane
         confidence = np.array([pose.confidence for pose in poses])
-        places, sure = np.reshape([pose.place for pose in poses], (-1, 2)), confidence > SURE
+        places, sure = np.reshape([pose.place for pose in poses], (-1, 3)), confidence > SURE
         return Tracked(
             np.where(sure[:, None], plane.enlarge(plane.pixels(places, MIDDLE)), np.nan),
             tuple(SEEN if one else LOST for one in sure), confidence,
@@ -158,16 +172,24 @@ class RigidTracker:
         if one.searched is not None and self._still(one, one.searched, picture):
             return
         one.searched, one.waits = None, one.waits - 1
+        over = [other.place[2] for other in self._objects if other is not one
+                and np.linalg.norm((other.place - one.place)[:2]) < APART]
+        if over and max(over) > one.place[2] + LIFTED:  # it stays under that
+            one.state, one.age, one.confidence = HIDDEN, 0, DOUBT[HIDDEN][0]
+            return
+        guesses = [one.place * (1, 1, bool(over))]  # nothing floats
         if hand is not None:
-            one.place = one.place + one.pushed(hand)
+            lifted = one.carried(hand) if self._plane.calibrated else []
+            guesses = [*lifted, *guesses] if one.place[2] else [one.pushed(hand), *lifted]
+        one.place = guesses[0]
         matcher = Matcher(picture, self._covered(one, picture))
-        pose = self._search(one, matcher, hand)
+        pose = self._search(one, matcher, hand, guesses[1:])
         if pose.fit > GOOD:
             one.place, one.angle, one.template = pose.place, pose.angle, pose.template
             one.age, one.confidence = 0, pose.confidence
             one.state = (SEEN if pose.sure else HIDDEN if pose.seen < 0.5 else UNSURE)
             one.searched = picture
-            if one.waits <= 0 and pose.seen > NEW_SEEN and (
+            if one.waits <= 0 and not one.place[2] and pose.seen > NEW_SEEN and (
                     one.part or pose.cost > NEW_COST or one.turned(one.nearest()[0]) > NEW_ANGLE):
                 self._cut_anew(one, picture)
             return
@@ -175,31 +197,38 @@ class RigidTracker:
         seen = matcher.score(key, one.place[None], np.array([one.angle - key.angle]))[1][0]
         one.age += 1
         one.state = HIDDEN if seen[0] < 0.5 else UNSURE if one.age <= PATIENCE else LOST
-        if one.state != HIDDEN and key.contrast > COLOURFUL:
+        if one.state != HIDDEN and key.contrast > COLOURFUL and not one.place[2]:
             place, amount = matcher.mean_shift(key, one.place)
             if MOST[0] < amount < MOST[1]:  # lifted, or turned to a side not seen before
                 one.place, one.state = place, UNSURE
         first, fall = DOUBT[one.state]
         one.confidence = first * fall ** (one.age - 1)
 
-    def _search(self, one: _Object, matcher: Matcher, hand: np.ndarray | None) -> Pose:
-        """Return the best pose near by, else anywhere."""
+    def _search(self, one: _Object, matcher: Matcher, hand: np.ndarray | None,
+                guesses: Sequence[np.ndarray]) -> Pose:
+        """Return the best pose near by, or near guesses where they fit better, else anywhere."""
         grown = 1 + 0.5 * min(one.age, 4)
         reach, turn, keys = REACH * grown, TURN * min(grown, 2), one.nearest()
         others = [(key, one.place) for key in (*keys[1:2], one.face)]
         if hand is not None:
             near = (hand[:, 2] < HAND_HIGH) & (
-                np.linalg.norm(hand[:, :2] - one.place, axis=1) < HAND_FAR)
+                np.linalg.norm((hand - one.place)[:, :2], axis=1) < HAND_FAR)
             if near.any():
-                others.append((keys[0], one.place + hand[1, :2] - hand[0, :2]))
-            elif one.age == 0:
+                others.append((keys[0], one.place + (hand[1] - hand[0]) * (1, 1, 0)))
+            elif one.age == 0 and not one.place[2]:
                 reach, turn = REST, REST_TURN
+        if guesses or one.place[2]:
+            reach, turn = CARRIED, CARRIED_TURN
         best = matcher.refine(keys[0], one.place, one.angle, reach, turn)
+        for key, place in product((keys[0], one.face), guesses):
+            pose = matcher.refine(key, place, one.angle, reach, turn)
+            if pose.seen > 0.5 and pose.cost < best.cost - CLEARER * bool(one.place[2]):
+                best = pose
         if best.fit > GOOD and best.cost < GOOD_COST:
             return best
         for key, place in others:
             pose = matcher.refine(key, place, one.angle, reach, turn)
-            if pose.cost < best.cost - 0.03:
+            if pose.cost < best.cost - CLEARER:
                 best = pose
         if one.age and best.fit <= GOOD or one.state != SEEN and not best.sure:
             avoid = [other.place for other in self._objects if other is not one]
@@ -254,7 +283,7 @@ class RigidTracker:
 
     def _tracked(self) -> Tracked:
         """Return where the objects are."""
-        places = np.array([one.place for one in self._objects]).reshape(-1, 2)
+        places = np.array([one.place for one in self._objects]).reshape(-1, 3)
         return Tracked(
             self._plane.enlarge(self._plane.pixels(places, MIDDLE)),
             tuple(one.state for one in self._objects),

@@ -41,7 +41,7 @@ class Template:
     Points of an object, with their colours, and points around it.
 
     :param mask: (h, w) bool of Picture, the object.
-    :param place: (2,) of the object; points are relative to it.
+    :param place: (3,) of the object; points are relative to it.
     :param angle: of the object in this picture, relative to the first one, rad.
     :param top: compare its top alone.
     :ivar area: px.
@@ -58,12 +58,12 @@ class Template:
         self.palette = Palette(picture.lab[mask], self.metric)
         outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL,
                                        cv2.CHAIN_APPROX_TC89_L1)
-        self.outline = plane.places(max(outlines, key=len)[:, 0]) - place
+        self.outline = plane.places(max(outlines, key=len)[:, 0])[:, :2] - place[:2]
         if plane.blur:  # pixels at its edge are mixed with the table
             inside = cv2.erode(part.astype(np.uint8), _round(2 * plane.blur + 1)) > 0
             part = inside if inside.sum() > 0.3 * part.sum() else part
         pixels = _draw(part, POINTS, rng)
-        self.points = (plane.places(pixels) - place).astype(np.float32)
+        self.points = (plane.places(pixels) - place)[:, :2].astype(np.float32)
         self.colours = np.pad(picture.lab[pixels[:, 1], pixels[:, 0]], ((0, 0), (0, 1)))
         self.indices = picture.index[pixels[:, 1], pixels[:, 0]]
         inner, outer = (cv2.dilate(part.astype(np.uint8), _round(side + 4 * plane.blur))
@@ -80,12 +80,12 @@ class Template:
             self.outward = np.arctan2(out[:, 1], out[:, 0])
         elif self.contrast <= CONTRAST:
             beside = beside[:0]
-        self.ring = (plane.places(beside) - place).astype(np.float32)
+        self.ring = (plane.places(beside) - place)[:, :2].astype(np.float32)
 
     def placed(self, points: np.ndarray, place: np.ndarray, angle: float) -> np.ndarray:
-        """Return points (N, 2) m of the object at a place, turned from the first picture."""
+        """Return points (N, 2) m of the object at a place (3,), turned: (N, 3)."""
         c, s = np.cos(angle - self.angle), np.sin(angle - self.angle)
-        return place + points @ np.array([[c, s], [-s, c]])
+        return place + points @ np.array([[c, s, 0], [-s, c, 0]])
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Pose:
     """Where a template was found; angle relative to the picture that it was cut from."""
 
     template: Template
-    place: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))  # (2,) m
+    place: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))  # (3,) m
     angle: float = 0.0  # rad
     cost: float = np.inf  # 0 to 1.35; inf: it was not found
     seen: float = 0.0  # share of the points that the robot does not hide
@@ -139,7 +139,7 @@ class Matcher:
         """
         Compare a template at all places with all angles.
 
-        :param places: (S, 2) m; angles: (A,) relative to the template's picture.
+        :param places: (S, 3) m; angles: (A,) relative to the template's picture.
         :param thin: take every so many points.
         :return: (A, S) each: cost, share seen, see Pose.
         """
@@ -151,7 +151,7 @@ class Matcher:
             index = self._look(template.ring[::thin], places, angles)
             like, free = self.likeness(template).take(index), self._words.take(index) >= 0
             if template.outward is not None:
-                x, y = self.picture.plane.eye - places.mean(0)
+                x, y = self.picture.plane.eye - places.mean(0)[:2]
                 away = np.cos(template.outward[::thin] + angles[:, None]
                               - np.arctan2(y, x)) < 0.2  # (A, R)
                 like, free = like * away[:, None], free & away[:, None]
@@ -190,9 +190,9 @@ class Matcher:
         c, s = np.cos(angles), np.sin(angles)
         x, y = points.T
         X, Y = np.outer(c, x) - np.outer(s, y), np.outer(s, x) + np.outer(c, y)  # (A, P)
-        u, v, scale = (np.add((across * X + down * Y)[:, None].astype(np.float32),
-                              (places @ (across, down) + still)[None, :, None].astype(np.float32))
-                       for across, down, still in self.picture.plane.levels[TOP])
+        u, v, scale = (np.add((row[0] * X + row[1] * Y)[:, None].astype(np.float32),
+                              ((places + (0, 0, TOP)) @ row[:3] + row[3])[None, :, None].astype(
+                                  np.float32)) for row in self.picture.plane.matrix)
         u, v = (np.floor(ray / scale + np.float32(0.5)).astype(np.int32) for ray in (u, v))
         return np.where((u < 0) | (u >= w) | (v < 0) | (v >= h), h * w, v * w + u)
 
@@ -242,7 +242,7 @@ class Matcher:
             cv2.circle(dense, (int(u), int(v)), int(side * 0.7), 0, -1)
         best = Pose(template)
         for place in (*peaks, *extra):
-            if (plane.calibrated and (np.abs(place) > EDGE).any()
+            if (plane.calibrated and (np.abs(place[:2]) > EDGE).any()
                     or any(np.linalg.norm(place - other) < APART for other in avoid)):
                 continue
             places = place + 0.03 * _square(5)
@@ -259,7 +259,7 @@ class Matcher:
         """
         Follow the colours of an object from a place: coarse, but minds neither height nor sides.
 
-        :return: (2,) the place where they are densest near by; and how much of them is there, as
+        :return: (3,) the place where they are densest near by; and how much of them is there, as
             a share of the object's own area.
         """
         plane, (h, w) = self.picture.plane, self.picture.size
@@ -290,6 +290,6 @@ def _mean(values: np.ndarray) -> np.ndarray:
 
 @cache
 def _square(count: int) -> np.ndarray:
-    """Return places (count * count, 2) from -1 to 1; of the first count the abscissa varies."""
+    """Return places (count * count, 3) from -1 to 1; of the first count the abscissa varies."""
     line = np.linspace(-1, 1, count)
-    return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+    return np.stack(np.meshgrid(line, line, 0), -1).reshape(-1, 3)

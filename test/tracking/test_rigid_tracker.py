@@ -288,6 +288,23 @@ def test_what_comes_to_a_plank_of_its_own_colour_is_not_unsure():
         simulator.close()
 
 
+@pytest.mark.parametrize('task, seed', [('pick_place', 88_006), ('stack2', 88_003)])
+def test_what_the_hand_carries_is_followed_through_the_air(task, seed):
+    simulator = Simulator(task, 256)
+    try:
+        episode = simulator.demonstrate(seed).episode
+        tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
+            simulator.camera_matrix, (256, 256), simulator.camera_pose))
+    finally:
+        simulator.close()
+    views = [View(*seen) for seen in zip(episode.frames, episode.robot_masks, episode.grippers)]
+    tracker.select(views[0], episode.object_pixels[0])
+    found = [tracker.update(view) for view in views[1:]]
+    off = np.linalg.norm([one.pixels for one in found] - episode.object_pixels[1:], axis=-1)
+    assert (episode.object_poses[..., 2] > 0.12).sum() > 2 and off.max() < 8
+    assert all(one.states[-1] == SEEN for one in found)
+
+
 @pytest.mark.parametrize('place, along', [
     ((0, -1, TOP), (0, 1, 0)), ((0, 0, 1), (0, 0, 1)), ((0, -1, 0.1), (0, 1, 0)),
     ((0, 0, -1), (0, 0, 1)), ((90, 0, 1), (0, 0, -1))])

@@ -311,7 +311,7 @@ class TrackerNode(Node):
         poses = None
         if plane is not None:
             poses = np.full((len(found), 7), np.nan)
-            poses[:, :2] = plane.places(plane.shrink(tracked.pixels), MIDDLE)
+            poses[:, :2] = plane.places(plane.shrink(tracked.pixels), MIDDLE)[:, :2]
             poses[:, 2] = MIDDLE
             poses[(np.array(tracked.states) == LOST) | ~np.isfinite(poses[:, :3]).all(1)] = np.nan
         message = encode_objects(
