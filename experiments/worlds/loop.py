@@ -257,7 +257,8 @@ def write_results(runs, out, args):
         values = {'table': summarise(rows), 'marked': MARKED, 'episodes': args.episodes,
                   'steps': args.steps, 'predictor_steps': args.predictor_steps,
                   'start': f'{np.mean([row["start_cm"] for row in rows]):.1f}',
-                  'budget': BUDGETS['push-wall-v3'],
+                  'budget': BUDGETS['push-wall-v3'], 'scenes': args.scenes, 'seeds': args.seeds,
+                  'legs': last_legs([row for row in rows if row['task'] in SUBGOALS]),
                   'dropped': {method: dropped(rows, method) for method in LEARNED},
                   'more': ahead([row for row in rows if row['task'] in WAYS])}
         template = f'worlds/templates/{page}.md.j2'
@@ -291,6 +292,13 @@ def dropped(rows, method):
         for said in (True, False)]
     return '{2} of {4} ({0} succeed, of the others {1} of {3})'.format(
         *map(sum, there), *map(len, there), sum(map(len, there)))
+
+
+def last_legs(rows):
+    """Say how many failures of the subgoal come after all subgoals were passed; '': none failed."""
+    failed = [row for row in rows if row['method'] == 'subgoal' and not row['ends']]
+    passed = sum(len(row['switches']) == SUBGOALS[row['task']] for row in failed)
+    return f'{passed} of {len(failed)} failures' if failed else ''
 
 
 def summarise(rows):

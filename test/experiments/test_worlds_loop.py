@@ -81,6 +81,15 @@ def test_runs_in_which_no_command_goes_to_a_subgoal_are_told_apart():
                         'subgoal') == '2 of 5 (1 succeed, of the others 2 of 3)'
 
 
+def test_failures_after_all_subgoals_are_told_apart():
+    rows = [{'task': 'push-wall-v3', 'method': method, 'ends': ends, 'switches': switches}
+            for method, ends, switches in (
+                ('subgoal', False, [3, 9]), ('subgoal', False, [3]), ('subgoal', True, [2, 5]),
+                ('direct', False, []))]
+    assert loop.last_legs(rows) == '1 of 2 failures'
+    assert loop.last_legs(rows[2:]) == ''
+
+
 def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
         tmp_path, monkeypatch):
     ran = []
