@@ -295,7 +295,7 @@ def dropped(rows, method):
 
 
 def last_legs(rows):
-    """Say how many failures of the subgoal come after all subgoals were passed; '': none failed."""
+    """Say how many failures of the subgoal came after its last one; nothing where none failed."""
     failed = [row for row in rows if row['method'] == 'subgoal' and not row['ends']]
     passed = sum(len(row['switches']) == SUBGOALS[row['task']] for row in failed)
     return f'{passed} of {len(failed)} failures' if failed else ''
