@@ -100,7 +100,7 @@ def run(args):
 
 def score_tasks(tasks, methods, args, prefix=''):
     """
-    Collect demonstrations, score keyframes of them and trainings on them.
+    Collect demonstrations, score keyframes of them and trainings on them; print each score.
 
     :param tasks: by their names seeds of their first demonstrations.
     :param prefix: of the tasks' names in the results, and of their folders.
@@ -125,9 +125,12 @@ def score_tasks(tasks, methods, args, prefix=''):
         for seed in range(args.seeds):
             mark(folder, training, seed)
         # Of keyframes all are held out that no seed marks.
-        rows += [{'task': prefix + name, **row} for row in score(
-            [place_marks(folder, training, seed) for seed in range(args.seeds)],
-            training[MARKED * args.seeds:] + held_out)]
+        scored = score([place_marks(folder, training, seed) for seed in range(args.seeds)],
+                       training[MARKED * args.seeds:] + held_out)
+        rows += [{'task': prefix + name, **row} for row in scored]
+        print(f'{prefix}{name}, in the bottleneck, within a frame:', ', '.join(
+            f"{row['method']} {row['hit']['value']:.0%}, {row['near']['value']:.0%}"
+            for row in scored), flush=True)
     return rows + average(
         train_all(folders, methods, args.seeds, args.runs, args.engine)), strips
 

@@ -69,6 +69,8 @@ def train_all(folders, methods, seeds, out, engine):
             name, method, number = task.name.rsplit('/', 2)
             rows.append({'task': name, 'method': method, 'seed': int(number), **get()})
             bar.update()
+            bar.write(f'{task.name}: ' + ', '.join(
+                f'{np.mean(rows[-1][key]):.0%}' for key in ('hit', 'near')))
     return rows
 
 
