@@ -48,7 +48,7 @@ demo: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros demo $(if $(SCENES),--scenes $(SCENES)) $(ARGS)
 
 explore: build
-	@$(ENTER); $(DOMAIN); python -m tap_ros explore $(ARGS)
+	@$(ENTER); python -m tap_ros explore $(ARGS)
 
 test: build
 	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) -m 'not minutes' $(ARGS)

@@ -3,6 +3,7 @@
 """The command `python -m tap_ros mark`: a page in the browser to mark the bottleneck."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from http import HTTPStatus
 import json
@@ -107,7 +108,8 @@ def run(args: Options) -> None:
             words_of(reading)) as server:
         print(f'open {server.url} in a browser; marks go to {escaped(path)}; Ctrl-C ends',
               flush=True)
-        server.serve_forever()
+        with suppress(KeyboardInterrupt):  # the way to end it
+            server.serve_forever()
 
 
 def parse_names(text: str) -> list[str]:

@@ -7,7 +7,10 @@ from dataclasses import replace
 import json
 from pathlib import Path
 import shlex
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from urllib.error import HTTPError
@@ -88,6 +91,18 @@ def put(ask, episode, frames, wait=True):
         time.sleep(0.02)
         state = json.load(ask('state'))
     return state
+
+
+def test_the_page_ends_with_an_interrupt_as_it_should(bag, tmp_path):
+    with subprocess.Popen(
+            [sys.executable, '-m', 'tap_ros', 'mark', str(bag), '--names', 'grasp', '--port', '0',
+             '--marks', str(tmp_path / 'marks.json')], text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+        assert 'Ctrl-C ends' in command.stdout.readline()
+        time.sleep(0.5)
+        command.send_signal(signal.SIGINT)
+        assert command.wait(30) == 0
+        assert 'Traceback' not in command.stderr.read()
 
 
 def test_marks_are_written_at_once_and_what_is_refused_changes_nothing(page, bag, store):

@@ -213,6 +213,15 @@ def enlarged_pictures(side):
     return [cv2.resize(one, (side, side), interpolation=cv2.INTER_LINEAR) for one in PICTURES]
 
 
+def test_a_refusal_that_repeats_is_logged_once_until_a_request_is_answered(services, capfd):
+    plain = services['plain']
+    for _ in range(2):
+        for _ in range(3):
+            plain.refusal(mode='forward', **WITH_GOAL)
+        plain.answer(**WITH_GOAL)
+    assert ''.join(capfd.readouterr()).count('predict_subgoal refused') == 2
+
+
 def test_a_picture_whose_robot_mask_is_missing_is_refused(services):
     masked = services['masked']
     masked.answer(start=START, goal=GOAL)  # what a request brings along stays as it is

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros explore`: all nodes, and a page in the browser to try them."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 import time
 from typing import Annotated
@@ -56,9 +57,10 @@ def run(args: Options) -> None:
         print(f'starting nodes; their logs are in {folder}', flush=True)
         print(f'open {processes.wait_until_ready()} in a browser; Ctrl-C ends all nodes',
               flush=True)
-        while True:
-            time.sleep(0.2)
-            processes.check()
+        with suppress(KeyboardInterrupt):  # the way to end it
+            while True:
+                time.sleep(0.2)
+                processes.check()
 
 
 def start_nodes(processes: NodeProcesses, args: Options) -> None:

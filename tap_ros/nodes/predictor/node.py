@@ -62,6 +62,7 @@ class PredictorNode(LifecycleBase):
         super().__init__('predictor_node', **options)
         self.params = declare_parameters(self)
         self._predictor: Predictor | None = None
+        self._refused = ''  # why the last request was, if it was
         self._queue: RequestQueue[requests.PendingRequest, Found] | None = None
         self.autostart('configure')
         goal = goal_topics(self.params['robot_mask'])
@@ -171,6 +172,7 @@ class PredictorNode(LifecycleBase):
             self._refuse(send, error)
             return
         send(response)
+        self._refused = ''
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         self._unshown.append(shown)
 
@@ -181,7 +183,9 @@ class PredictorNode(LifecycleBase):
         if isinstance(error, Busy):
             self.get_logger().warning(f'predict_subgoal: {error}', throttle_duration_sec=1.0)
         elif isinstance(error, TapError):
-            self.get_logger().warning(f'predict_subgoal refused: {error}')
+            if self._refused != str(error):  # whoever asks again and again is told each time
+                self._refused = str(error)
+                self.get_logger().warning(f'predict_subgoal refused: {error}')
         else:
             self._diagnostics.error(error)
         send(PredictSubgoal.Response(
