@@ -307,6 +307,7 @@ def test_what_marks_is_in_sight_at_a_desk_and_on_a_phone_and_keys_press_what_the
                 assert not hidden_or_over(
                     page, 'header', '#title', '#shown', '#time', '#names', '#accept', '#next')
                 before = page.locator('#names button').first.bounding_box()
+                page.keyboard.press('ArrowRight')
                 page.keyboard.press('1')
                 assert 'release not yet' in page.inner_text('#title') and marking.state()[
                     'marks'].keys() == {*range(i)}
@@ -325,3 +326,38 @@ def test_what_marks_is_in_sight_at_a_desk_and_on_a_phone_and_keys_press_what_the
                 shown = page.evaluate('episode')
                 page.click('#next')
                 page.wait_for_function(f'episode !== {shown}')
+
+
+@needs_browser
+@pytest.mark.slow
+def test_a_hand_that_moves_proposes_nothing_without_labels_and_what_is_marked_stays(
+        bag, store, tmp_path, monkeypatch):
+    monkeypatch.setattr('tap_ros.apps.marking.gripper_moves', lambda _: [(3, None), (6, None)])
+    monkeypatch.setattr('tap_ros.apps.mark_labels.BackgroundLabels._find', lambda self, marks, _: {
+        i: [(4, 0.9), (6, 0.8)] for i in self._chosen if i not in marks} if len(marks) > 2 else {})
+    marking = Marking(store, [str(bag)], tmp_path / 'marks.json', ['grasp', 'release'])
+    with serving(marking) as ask, chromium() as browser, opened(browser, ask('').url) as page:
+        page.wait_for_function("about && document.getElementById('now').naturalWidth")
+        for k in range(3):
+            assert page.evaluate('frame') == 0 and page.is_hidden('#accept')
+            assert 'hand' in page.inner_text('#ticks')
+            page.keyboard.press('a')
+            assert page.inner_text('#said') == 'Nothing is proposed here.'
+            for key in ('ArrowRight', '1', 'ArrowRight', '2'):
+                page.keyboard.press(key)
+            page.wait_for_function(f'Object.keys(state.marks).length === {k + 1}')
+            if k < 2:
+                page.keyboard.press('n')
+                page.wait_for_function('!state.marks[episode]')
+        page.wait_for_function('Object.keys(state.labels).length')
+        page.keyboard.press('n')
+        page.wait_for_function('!state.marks[episode]')
+        assert page.is_visible('#accept') and page.evaluate('frame') == 3
+        page.evaluate('go(1)')
+        page.keyboard.press('1')
+        assert page.inner_text('#accept') == 'accept 1.5 s (a)', 'what is marked stays'
+        page.keyboard.press('a')
+        page.wait_for_function('Object.keys(state.marks).length === 4 && isSaved()')
+        assert page.is_hidden('#accept')
+        page.keyboard.press('a')
+        assert page.evaluate('draft') == page.evaluate('state.marks[episode]') == [1, 6]

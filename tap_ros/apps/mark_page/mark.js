@@ -24,10 +24,9 @@ const isSaved = () => String(draft) === String(state.marks[episode] || []);
 const given = () => draft.filter((t) => t !== null);
 const labels = () => state.marks[episode] ? [] : state.labels[episode] || [];
 
-// What the key a accepts: a frame for each name, that of its label, or where the hand moves beside it; without labels where
-// the hand moves.
+// A frame for each name: that of its label, or where the hand moves beside it; without labels where a gripper closes or opens.
 function proposed() {
-  const guess = labels().map(([t]) => t), moves = about.moves.map(([t]) => t);
+  const guess = labels().map(([t]) => t), moves = about.moves.filter(([, closes]) => closes !== null || guess.length).map(([t]) => t);
   const first = Math.max(0, about.moves.findIndex(([, closes]) => closes));  // it closes before it opens
   const others = Object.values(state.marks).map((frames) => frames.length);
   const count = names().length || others[0] || guess.length || moves.length - first;
@@ -39,6 +38,15 @@ function proposed() {
     .sort((a, b) => off(a, wanted) - off(b, wanted))[0] ?? wanted);
   return found.every((t, k) => !k || t > found[k - 1]) ? found : guess;
 }
+
+// What the key a makes of the draft: what is marked stays.
+function accepted() {
+  if (!names().length) return draft.length ? draft : proposed();
+  const offer = proposed(), frames = draft.map((t, k) => t ?? offer[k] ?? null), set = frames.filter((t) => t !== null);
+  return set.every((t, k) => !k || t > set[k - 1]) ? frames : draft;
+}
+
+const added = () => accepted().filter((t, k) => t !== (draft[k] ?? null));
 
 function show(t) {
   const last = state.lengths[episode] - 1;
@@ -76,8 +84,8 @@ function draw() {
   const free = Math.max(0, draft.indexOf(null));  // what Enter marks
   fill($('names'), names().length ? names() : ['Mark'], (name, k) => Object.assign(
     button(names().length ? `${k + 1} ${name}` : name, () => mark(names().length ? k : null)), {className: k === free ? 'main' : ''}));
-  const offer = proposed();
-  $('accept').hidden = !offer.length || String(offer) === String(draft);
+  const offer = added();
+  $('accept').hidden = !offer.length;
   $('accept').textContent = `accept ${offer.map(second).join(', ')} (a)`;
   fill($('list'), Object.entries(state.marks), ([i, frames]) => made('li', {className: Number(i) === episode ? 'here' : ''},
     button(`${i}: ${state.seconds[i].map((s) => `${s.toFixed(1)} s`).join(', ')}`, () => { visit(Number(i), frames[0]); })));
@@ -128,7 +136,7 @@ async function open(i, wanted) {
     image.onclick = () => go(middle);
     return image;
   }));
-  show(wanted ?? given()[0] ?? proposed()[0] ?? Math.floor(length / 2));
+  show(wanted ?? given()[0] ?? (labels().length ? proposed()[0] : 0));
 }
 
 function takeMarks() {
@@ -185,10 +193,10 @@ function send(frames) {
 function accept() {
   playing = false;
   say('');
-  const offer = proposed();
-  if (!offer.length) { say('Nothing is proposed here.'); return; }
-  send(names().length ? names().map((_, k) => offer[k] ?? null) : offer);
-  show(offer[0]);
+  const [first] = added();
+  if (first === undefined) { say('Nothing is proposed here.'); return; }
+  send(accepted());
+  show(first);
 }
 
 async function next() {
