@@ -9,10 +9,11 @@ import math
 import socket
 import threading
 
+import cv2
 import numpy as np
 from processes import Client, LocalNode, Newest, until
 import pytest
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.apps.explorer.browser_commands import CommandError, parse_command
 from tap_ros.apps.explorer.display import GoalByHand
@@ -215,26 +216,35 @@ def problem_of(browser):
     return problem['text']
 
 
-def test_a_photograph_of_a_real_camera_becomes_the_goal():
+@pytest.mark.parametrize('transport', ['raw', 'compressed'])
+def test_a_photograph_of_a_real_camera_becomes_the_goal(transport):
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
     with ExitStack() as stack:
-        explorer = LocalNode(ExplorerNode, port=0, token='secret')
+        explorer = LocalNode(
+            ExplorerNode, port=0, token='secret', image_transport=transport)
         stack.callback(explorer.end)
         node = stack.enter_context(Client('camera'))
-        pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
+        pictures = node.create_publisher(
+            *((Image, 'camera/image_raw') if transport == 'raw' else
+              (CompressedImage, 'camera/image_raw/compressed')), STREAM)
         goal_image = Newest(node, Image, 'goal/image', LATCHED)
         goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
         url = explorer.node.url.replace('http', 'ws').replace('/?', '/socket?')
         assert url.endswith('?token=secret')
         browser = stack.enter_context(connect(url, open_timeout=60))
         browser.send('{"do": "photograph"}')
-        assert 'the camera is silent' in problem_of(browser)
+        assert problem_of(browser) == 'no goal picture: the camera is silent; no picture to take'
         assert until(pictures.get_subscription_count)
-        pictures.publish(encode_image(image, to_stamp(10**9), CAMERA_FRAME))
+        message = encode_image(image, to_stamp(10**9), CAMERA_FRAME)
+        if transport == 'compressed':
+            data = cv2.imencode('.png', image[..., ::-1])[1].tobytes()
+            message = CompressedImage(header=message.header, format='png', data=data)
+        pictures.publish(message)
         while not (isinstance(text := browser.recv(10), bytes) and text.startswith(b'camera\0')):
             pass
         browser.send('{"do": "photograph"}')
-        assert bytes(goal_image.wait(10).data) == image.tobytes()
+        goal = goal_image.wait(10)
+        assert bytes(goal.data) == image.tobytes() and goal.header == message.header
         assert not goal_objects.wait(10).objects, 'not those of another goal'
 
 

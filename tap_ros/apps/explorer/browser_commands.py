@@ -242,7 +242,7 @@ class ExplorerCalls:
 
     def _photograph(self) -> None:
         if self.offered('reset'):
-            raise CallError('photograph: the simulator takes its goal pictures itself')
+            raise CallError('the simulator takes its goal pictures itself')
         self._by_hand.photograph(
             self._display.newest.get('camera'), followed=self.offered('select'))
         self._display.events.add('goal: what the camera sees now', 'goal')

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import SelectObjects
 from tap_ros.apps.explorer.events import Events
@@ -26,7 +26,7 @@ from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.ros.calls import CallError
-from tap_ros.ros.topics import encode_objects, LATCHED
+from tap_ros.ros.topics import encode_image, encode_objects, LATCHED
 from visualization_msgs.msg import ImageMarker
 
 SILENT_S = 2.0  # after which the page says that a topic is silent
@@ -162,12 +162,12 @@ class GoalByHand:
             where it was in the goal before.
         :raises CallError: where that is of no use.
         """
-        message, received = camera or (None, -math.inf)
-        if time.monotonic() - received > SILENT_S:
-            raise CallError('photograph: the camera is silent; no picture to take')
-        if not isinstance(message, Image):
-            raise CallError('photograph: a goal picture is sensor_msgs/Image; start with '
-                            'image_transport:=raw')
+        if camera is None or time.monotonic() - camera[1] > SILENT_S:
+            raise CallError('the camera is silent; no picture to take')
+        message, _ = camera
+        if isinstance(message, CompressedImage):
+            header = message.header
+            message = encode_image(decode_image(message, 'camera'), header.stamp, header.frame_id)
         if not followed:
             self._publish(ObjectStates(header=message.header), 'goal/objects')
         self._publish(message, 'goal/image')
