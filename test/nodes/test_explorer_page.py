@@ -8,8 +8,8 @@ import numpy as np
 from processes import Client, LocalNode, until
 import pytest
 from sensor_msgs.msg import Image
-from tap_msgs.msg import ObjectStates
-from tap_msgs.srv import SelectObjects
+from tap_msgs.msg import Episode, ObjectStates
+from tap_msgs.srv import ResetScene, SelectObjects
 from tap_ros.apps.explorer.node import ExplorerNode
 from tap_ros.base.contract import CAMERA_FRAME
 from tap_ros.ros.topics import encode_image, encode_objects, STREAM, to_stamp
@@ -35,7 +35,7 @@ class Camera:
         self._image = np.full((HIGH, WIDE, 3), 90, np.uint8)
         self._stamp, self.selected = 10**9, None
         node.create_timer(0.1, self._send)
-        node.create_service(SelectObjects, 'select_objects', self._select)
+        self.service = node.create_service(SelectObjects, 'select_objects', self._select)
 
     def _send(self):
         self._stamp += 10**8
@@ -135,8 +135,11 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
             page.click('#photograph')
             page.wait_for_function('pictures.goal && state.goal.pictured')
             page.wait_for_function('events.length && events.at(-1).picture')
-            assert says(page, 'predict') == 'needs the predictor, which does not run'
+            assert says(page, 'predict') == 'needs the goal of object_0, ring: step 3'
             assert not {'predict', 'direct', 'subgoal-run'} & {*page.evaluate(LIVE)}
+            page.reload()
+            page.wait_for_function("$('hint').textContent.startsWith('Not found in this picture')")
+            assert says(page, 'goal') == 'drag to their goals: object_0, ring'
         page.wait_for_function("/silent/.test($('step-scene').textContent)")
         assert 'photograph' not in page.evaluate(LIVE)
 
@@ -174,6 +177,41 @@ def test_outlines_turn_with_objects_and_a_goal_that_is_moved_is_not_gone_on_to(e
                 f'state.goal.objects.some(({{u}}) => Math.abs(u - {place[0]}) < 2)')
         page.wait_for_function("/^go directly/.test($('direct').textContent)")
         assert says(page, 'go') == 'needs the planner, which does not run'
+        assert says(page, 'predict') == 'needs the predictor, which does not run'
+        page.set_viewport_size(dict(zip(('width', 'height'), PHONE)))
+        page.evaluate("showRun('step 3 of at most 80, to the subgoal', 'busy')")
+        assert page.evaluate("$('run').scrollWidth <= $('run').clientWidth")
+        assert not hidden_or_over(page, '#run', '#cancel', '#stage')
+
+
+def test_beside_a_camera_alone_the_page_says_what_to_start(explorer, browser):
+    with opened(browser, explorer.node.url) as page, Client('camera') as node:
+        camera = Camera(node)
+        node.destroy_service(camera.service)
+        page.wait_for_function('pictures.camera && !state.tracker && state.camera.width')
+        page.wait_for_function("$('hint').textContent")
+        assert says(page, 'objects') == 'waits for objects: start tracker_node'
+        assert page.inner_text('#hint') == 'Start tracker_node to click on objects here.'
+
+
+def test_a_scene_that_began_before_is_not_known_until_it_is_told(explorer, browser):
+    with opened(browser, explorer.node.url) as page, Client('sim_node') as node:
+        camera = Camera(node)
+        node.create_service(ResetScene, 'sim/reset', lambda _, answer: answer)
+        episodes = node.create_publisher(Episode, 'episode', STREAM)
+        page.wait_for_function('pictures.camera && state.simulator && state.camera.width')
+        page.wait_for_selector('#step-objects[aria-current=step]')
+        assert camera and not says(page, 'scene') and page.is_disabled('#start')
+        assert page.locator('#step-scene.done').count() == 0
+        assert [page.input_value(one) for one in ('#task', '#seed')] == ['', '']
+        page.select_option('#task', 'stack2')
+        page.fill('#seed', '3')
+        assert page.is_enabled('#start')
+        assert until(episodes.get_subscription_count)
+        episodes.publish(Episode(event=Episode.START, task='push2', seed=5))
+        page.wait_for_selector('#step-scene.done')
+        assert says(page, 'scene') == 'push2, seed 5'
+        assert [page.input_value(one) for one in ('#task', '#seed')] == ['push2', '5']
 
 
 def test_keys_and_a_screen_reader_reach_all_that_a_pointer_does(explorer, browser):

@@ -29,6 +29,7 @@ function connect() {
   };
 }
 
+const untracked = () => !state.tracker && !state.camera.objects.length;  // nobody tells where objects are
 const objectCount = (count) => `${count} ${count === 1 ? 'object' : 'objects'}`;
 const connected = () => socket.readyState === WebSocket.OPEN;
 
@@ -38,7 +39,8 @@ function take(message) {
     state = message;
     Object.assign(outlines, relative(state.camera.objects));
     if (before?.scene !== state.scene) {
-      $('seed').value = state.seed ?? 7;
+      $('seed').value = state.seed ?? '';
+      if (state.task) $('task').value = state.task;
       step = '';
       select(false);
     }
@@ -86,16 +88,18 @@ function progress() {
   const count = camera.objects.length, missing = missingGoals();
   const camera_why = !camera.width ? 'waits for the camera' : camera.note && `the camera is ${camera.note}`;
   const goal_why = goal.pictured ? '' : 'needs a goal picture: step 3';
-  const predict_why = camera_why || goal_why || (!state.predictor && 'needs the predictor, which does not run');
+  const place_why = missing.length ? `needs the goal of ${missing.join(', ')}: step 3` : '';
+  const predict_why = camera_why || goal_why || place_why || (!state.predictor && 'needs the predictor, which does not run');
   const go_why = !state.plans ? `nothing plans how to grasp: for ${state.task} subgoals are predicted only`
-    : camera_why || (!count && 'needs objects: step 2') || (missing.length && `needs the goal of ${missing.join(', ')}: step 3`)
+    : camera_why || (!count && 'needs objects: step 2') || place_why
     || (!state.planner && 'needs the planner, which does not run');
+  const known = !simulator || Boolean(state.task);  // what scene it is
   const clicked = clicks.length ? `${objectCount(clicks.length)} so far` : 'waits for objects: click on them';
   const unsure = camera.objects.filter((one) => ['unsure', 'lost'].includes(one.state)).map(({name}) => name);
   return {
-    scene: [!camera_why, camera_why || (!simulator ? `${camera.width}x${camera.height} pixels`
-      : state.seed === null ? state.task : `${state.task}, seed ${state.seed}`)],
-    objects: [count > 0 && !anew, selecting() ? clicked : !count ? 'waits for objects'
+    scene: [!camera_why && known, camera_why || (!known ? '' : !simulator ? `${camera.width}x${camera.height} pixels`
+      : state.seed === null ? state.task : `${state.task}, seed ${state.seed}`), camera_why],
+    objects: [count > 0 && !anew, selecting() ? clicked : !count ? untracked() ? 'waits for objects: start tracker_node' : 'waits for objects'
       : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
       ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
@@ -108,17 +112,24 @@ function progress() {
 function showState() {
   const {run, goal} = state, done = progress(), on = connected();
   if (on && run.running) showRun(run.stage.split(', plan')[0] || 'starting', 'busy');
-  else if (on) showRun(done.scene[0] ? 'the arm stands still' : done.scene[1], done.scene[0] ? 'good' : '');
+  else if (on) showRun(done.scene[2] || 'the arm stands still', done.scene[2] ? '' : 'good');
   document.body.classList.toggle('running', on && run.running);
-  lead(run.running || run.reached ? 'go' : STEPS.find((one) => !done[one][0]) ?? 'go', run.running || run.end);
+  lead(run.running || run.reached ? 'go' : STEPS.find((one) => !done[one][0] && done[one][1]) ?? 'go', run.running || run.end);
   for (const one of STEPS) {
     const item = $(`step-${one}`);
     item.classList.toggle('done', Boolean(done[one][0]));
     item.querySelector('span').textContent = done[one][1];
   }
+  if (state.tasks.join() !== [...$('task').options].map((one) => one.value).join()) {
+    fill($('task'), state.tasks, (task) => new Option(task, task));
+    $('task').value = '';
+  }
+  if (!$('task').value) $('task').value = state.task;
   // What cannot work yet cannot be pressed.
   const busy = !on ? 'there is no connection' : run.running ? 'the arm moves: wait for its end, or cancel' : '';
-  for (const id of ['task', 'seed', 'start', 'another']) allow(id, busy);
+  for (const id of ['task', 'seed']) allow(id, busy);
+  allow('another', busy || (!$('task').value && 'choose a task'));
+  allow('start', busy || (!($('task').value && $('seed').value) && 'choose a task and a seed'));
   allow('propose', busy || done.objects[2] || (!goal.pictured && 'needs a goal picture'),
     'what differs between the picture of now and the goal');
   allow('follow', busy || done.objects[2] || (!clicks.length && 'click on the objects first'), 'they are followed from now on');
@@ -136,11 +147,6 @@ function showState() {
   $('again').textContent = anew ? 'keep the old objects' : 'choose other objects';
   $('follow').textContent = clicks.length ? `use ${clicks.length > 1 ? 'these' : 'this'} ${objectCount(clicks.length)}` : 'use these objects';
   $('view-observer').parentElement.hidden = !state.observer;
-  if (state.tasks.join() !== [...$('task').options].map((one) => one.value).join()) {
-    fill($('task'), state.tasks, (task) => new Option(task, task));
-    $('task').value = '';
-  }
-  if (!$('task').value) $('task').value = state.task || state.tasks[0];
   listObjects();
   const wrong = state.nodes.filter((one) => one.state === 'wrong').length;
   $('nodes').className = wrong ? 'wrong' : '';
@@ -155,9 +161,9 @@ function showState() {
   draw();
 }
 
-/* Goes to the step that is to be done, once; moves: whether the arm moves there, or has. */
+/* Goes to the step that is to be done, once, and once its picture is there; moves: whether the arm moves there, or has. */
 function lead(now, moves) {
-  const at = `${now} ${moves}`;
+  const at = `${now} ${moves || Boolean(pictures[VIEW[now]])}`;
   if (at === step) return;
   step = at;
   for (const one of STEPS) {
@@ -181,7 +187,7 @@ function hint() {
   }
   const missing = missingGoals(), moves = movable();
   return {
-    camera: `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
+    camera: untracked() ? 'Start tracker_node to click on objects here.' : `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
     goal: moves && missing.length ? `Not found in this picture: ${missing.join(', ')}. Drag each to where it shows it.`
       : `What the table is to look like.${moves ? ' Drag an object to change that.' : ''}`,
     subgoal: 'The predicted picture in between: each object glows where it is expected then.',
@@ -212,6 +218,7 @@ $('scene').addEventListener('submit', (event) => {
   event.preventDefault();
   begin();
 });
+$('scene').addEventListener('input', () => state && showState());
 $('another').addEventListener('click', () => {
   $('seed').value = Math.floor(1e6 * Math.random());
   begin();
