@@ -4,9 +4,7 @@
 The same work alone and beside processes that spin, one a core, in turns.
 
 Beside N processes that spin on c cores, each of t threads that work gets c / (t + N) of a core.
-So work that keeps t cores busy when alone takes (t + N) / c times as long. How much longer a plain
-loop takes, with t = 1, is measured first: cores that share caches and clocks are slower together.
-What is more than that is lost.
+So work that keeps t cores busy when alone takes (t + N) / c times as long; what is more is lost.
 """
 
 from collections.abc import Callable
@@ -60,37 +58,30 @@ class Work:
 
 def run(args):
     """Measure how much longer each work takes beside others."""
-    count, loop = args.spinning or CORES, None
     with contextlib.ExitStack() as stack:
         for work in works(stack):
             work.seconds()  # to warm up
-            row = compare(work, args.pairs, count, loop)
-            loop = loop or row.ratio
-            yield row
+            yield compare(work, args.pairs, args.spinning or CORES)
 
 
-def compare(work, pairs, count, loop):
-    """Do a work in turns alone and beside `count` processes; loop: the ratio of the first."""
+def compare(work, pairs, count):
+    """Do a work in turns alone and beside `count` processes; return the row."""
     times = np.empty((pairs, 2))
     for pair in times:
         pair[0] = work.seconds()
         with recording.beside(count):
             pair[1] = work.seconds()
-    ratios = times[:, 1] / times[:, 0]
-    factor = (work.threads + count) / (1 + count)
-    share, aim, limit = (loop * factor, f'at most {factor:.2f} x the loop', 'waiting for a core'
-                         ) if loop else ((1 + count) / CORES, f'at most {(1 + count) / CORES:.1f}',
-                                         'cores are slower together')
+    ratios, share = times[:, 1] / times[:, 0], (work.threads + count) / CORES
     reached = bool(np.median(ratios) <= share)
     return Row(f'{work.what} beside {count} busy processes',
                f'{1000 * np.median(times[:, 1]):,.1f} ms', float(np.median(ratios)),
-               f'alone ({ratios.min():.2f} to {ratios.max():.2f})', aim, reached,
-               '' if reached else limit)
+               f'alone ({ratios.min():.2f} to {ratios.max():.2f})',
+               f'at most {share:.1f}', reached,
+               '' if reached else 'waiting for a core')
 
 
 def works(stack):
-    """Yield every Work, a plain loop first; what it needs ends with the stack."""
-    yield Work('a loop', 1, spin)
+    """Yield every Work; what it needs ends with the stack."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     paths, _ = recording.write_files(folder, 'none', 100, 1)
     yield Work('open 100 episodes', 1, partial(open_files, paths))
@@ -110,14 +101,6 @@ def works(stack):
             predictor(folder), asking() as seconds:
         yield Work('answer, node and client by `chrt --rr 1`,', 1, seconds)
     yield Work('start of all nodes', CORES, lambda: start.time_start()[0])
-
-
-def spin():
-    """Count; return s."""
-    begin = time.perf_counter()
-    for _ in range(10 ** 7):
-        pass
-    return time.perf_counter() - begin
 
 
 @contextlib.contextmanager
