@@ -44,7 +44,7 @@ def bars():
         found[title] = [['fixed time', FIXED, *predicted(task, FIX, at, False)],
                         ['tap_ros', HERE, *predicted(task, RELATIVE, at, False)]]
     success = {
-        title: [['direct', PAPER, *succeeded(task, 'direct')],
+        title: [*([] if 'late' in fix else [['direct', PAPER, *succeeded(task, 'direct')]]),
                 ['fixed time', FIXED, *succeeded(task, fix)],
                 ['tap_ros', HERE, *succeeded(task, ours)]]
         for task, title, fix, ours in (
