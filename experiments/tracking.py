@@ -17,6 +17,7 @@ from experiments.clicks import score_covered, score_pale
 from experiments.pages import render, share
 from experiments.tables import find, number, RESULTS
 from experiments.tracks import draw, score_bag, score_films
+import numpy as np
 import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
 from tap_ros.base.engines import Engine
@@ -176,7 +177,11 @@ def loop(folder):
     def said(task, metric, method=METHODS[1], **about):
         return find(folder, 'planning.json', task=task, method=method, metric=metric, **about)
 
-    lines, tracked = [], {}
+    def scenes_of(task, method):
+        name = f'{task}-{method.replace(":", "--")}.json'
+        return json.loads(Path(folder, 'planning', name).read_text())['scenes']
+
+    lines, tracked, alone = [], {}, {}
     for task in PUSHED:
         gap = said(task, 'success_5cm_difference', compares='tracking')
         true, mine = (number(said(task, 'success_5cm', method), 100) for method in METHODS)
@@ -184,13 +189,14 @@ def loop(folder):
         lines.append({'': task, 'true pixels': true, 'tracked': mine, 'scenes': gap.n,
                       'difference': number(gap, 100, 0, ' points', '+'),
                       'distance left, cm: true, tracked': ', '.join(left)})
-        tracked[task] = json.loads(Path(
-            folder, 'planning', f'{task}-{METHODS[1].replace(":", "--")}.json').read_text())[
-                'scenes']
+        tracked[task] = scenes_of(task, METHODS[1])
+        ends = np.array([[max(scene['objects_cm']) <= REACHED_CM for scene in scenes]
+                         for scenes in (scenes_of(task, METHODS[0]), tracked[task])])
+        alone[task] = tuple((ends & ~ends[::-1]).sum(1))
     scenes = [scene for those in tracked.values() for scene in those]
     placed = [scene for scene in scenes if 'placed' in scene]
     return {
-        'table': pd.DataFrame(lines), 'scenes': len(scenes), 'placed': len(placed),
+        'table': pd.DataFrame(lines), 'alone': alone, 'scenes': len(scenes), 'placed': len(placed),
         'placed_failed': sum(max(scene['objects_cm']) > REACHED_CM for scene in placed),
         'refused': sum('refused' in scene for scene in scenes),
         'command': f'python -m experiments planning --tasks {" ".join(PUSHED)} --methods '

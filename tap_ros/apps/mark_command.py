@@ -106,9 +106,9 @@ def run(args: Options) -> None:
     with only_keeper(path), MarkServer(
             Marking(store, args.recordings, path, names), args.port, reading.crop,
             words_of(reading)) as server:
-        print(f'open {server.url} in a browser; marks go to {escaped(path)}; Ctrl-C ends',
-              flush=True)
         with suppress(KeyboardInterrupt):  # the way to end it
+            print(f'open {server.url} in a browser; marks go to {escaped(path)}; Ctrl-C ends',
+                  flush=True)
             server.serve_forever()
 
 

@@ -215,7 +215,7 @@ class RigidTracker:
                 np.linalg.norm((hand - one.place)[:, :2], axis=1) < HAND_FAR)
             if near.any():
                 others.append((keys[0], one.place + (hand[1] - hand[0]) * (1, 1, 0)))
-            elif one.age == 0 and not one.place[2]:
+            elif one.age == 0:
                 reach, turn = REST, REST_TURN
         if guesses or one.place[2]:
             reach, turn = CARRIED, CARRIED_TURN

@@ -190,9 +190,10 @@ class Matcher:
         c, s = np.cos(angles), np.sin(angles)
         x, y = points.T
         X, Y = np.outer(c, x) - np.outer(s, y), np.outer(s, x) + np.outer(c, y)  # (A, P)
+        matrix, tops = self.picture.plane.matrix, places + (0, 0, TOP)
         u, v, scale = (np.add((row[0] * X + row[1] * Y)[:, None].astype(np.float32),
-                              ((places + (0, 0, TOP)) @ row[:3] + row[3])[None, :, None].astype(
-                                  np.float32)) for row in self.picture.plane.matrix)
+                              (tops @ row[:3] + row[3])[None, :, None].astype(np.float32))
+                       for row in matrix)
         u, v = (np.floor(ray / scale + np.float32(0.5)).astype(np.int32) for ray in (u, v))
         return np.where((u < 0) | (u >= w) | (v < 0) | (v >= h), h * w, v * w + u)
 

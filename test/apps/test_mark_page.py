@@ -99,7 +99,6 @@ def test_the_page_ends_with_an_interrupt_as_it_should(bag, tmp_path):
              '--marks', str(tmp_path / 'marks.json')], text=True,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
         assert 'Ctrl-C ends' in command.stdout.readline()
-        time.sleep(0.5)
         command.send_signal(signal.SIGINT)
         assert command.wait(30) == 0
         assert 'Traceback' not in command.stderr.read()

@@ -55,9 +55,9 @@ def run(args: Options) -> None:
     with NodeProcesses(folder) as processes:
         start_nodes(processes, args)
         print(f'starting nodes; their logs are in {folder}', flush=True)
-        print(f'open {processes.wait_until_ready()} in a browser; Ctrl-C ends all nodes',
-              flush=True)
+        url = processes.wait_until_ready()
         with suppress(KeyboardInterrupt):  # the way to end it
+            print(f'open {url} in a browser; Ctrl-C ends all nodes', flush=True)
             while True:
                 time.sleep(0.2)
                 processes.check()
