@@ -23,6 +23,8 @@ from tap_ros.images.encodings import decompress
 from tap_ros.images.pixels import resize_image, to_float, to_uint8
 from tap_ros.prediction.retrieval import (
     ends_of,
+    EQUAL,
+    LARGEST_WEIGHT,
     nearest_others,
     places_then,
     SIDE,
@@ -39,7 +41,8 @@ FARTHEST = 1e6  # px from the picture's corner that a known place may be
 NOWHERE = -FARTHEST  # in a file: unknown
 MOST_BYTES = 2**28  # of all of them together, as rgb
 _PREFIX = 'bank.'
-_ENDS, _KEYFRAME, _OBJECTS = f'{_PREFIX}ends', f'{_PREFIX}keyframe.', f'{_PREFIX}objects'
+_ENDS, _KEYFRAME, _OBJECTS, _WEIGHTS = (
+    _PREFIX + name for name in ('ends', 'keyframe.', 'objects', 'weights'))
 
 
 class KeyframeBank:
@@ -51,15 +54,16 @@ class KeyframeBank:
         recursion.
     :param objects: float32 (N, 1 + L, K, 2), (u, v) of objects in the start and the keyframes, in
         pixels of the network; NaN where unknown. None: nothing is known.
-    :raises ConfigError: for none, too many, or as many of one as not of the others, and for
-        places beyond FARTHEST.
+    :param weights: int32 (2, SIDE, SIDE), of the pixels of start and goal, see retrieval.nearest.
+    :raises ConfigError: for none, too many, or as many of one as not of the others, for places
+        beyond FARTHEST, and for weights that are none.
     :raises ImageError: for pictures that are damaged, too large together, or differ in size.
     :ivar keyframes: N * L pictures uint8 (H, W, 3), at the recorded size.
     :ivar levels: L.
     """
 
     def __init__(self, ends: np.ndarray, files: list[bytes],
-                 objects: np.ndarray | None = None) -> None:
+                 objects: np.ndarray | None = None, weights: np.ndarray = EQUAL) -> None:
         N, self.levels = len(ends), len(files) // max(1, len(ends))
         if ends.dtype != np.uint8 or ends.shape != (N, 2, SIDE, SIDE, 3) or not (
                 1 <= N <= MOST and 1 <= self.levels <= MOST_LEVELS
@@ -73,7 +77,10 @@ class KeyframeBank:
             raise ConfigError(f'expected places of at most {MOST_OBJECTS} objects in each')
         if objects is not None and np.abs(np.nan_to_num(objects)).max(initial=0) > FARTHEST:
             raise ConfigError(f'expected places of objects of at most {FARTHEST:.0f} pixels')
-        self._ends, self._files, self._objects = ends, files, objects
+        if weights.dtype != np.int32 or weights.shape != EQUAL.shape or not (
+                0 <= weights.min() and 0 < weights.max() <= LARGEST_WEIGHT):
+            raise ConfigError(f'expected weights of pixels from 0 to {LARGEST_WEIGHT}, not all 0')
+        self._ends, self._files, self._objects, self._weights = ends, files, objects, weights
         self.keyframes = [decompress(file, 'png', MOST_BYTES // len(files)) for file in files]
         if len({picture.shape for picture in self.keyframes}) > 1:
             raise ImageError('they differ in size')
@@ -90,7 +97,8 @@ class KeyframeBank:
 
     @classmethod
     def choose(cls, ends: np.ndarray, keyframe: Callable[[int], np.ndarray],
-               objects: np.ndarray | None = None, levels: int = 1) -> Self:
+               objects: np.ndarray | None = None, levels: int = 1,
+               weights: np.ndarray = EQUAL) -> Self:
         """
         Make a bank of the keyframes that cover all demonstrations best, as many as it may have.
 
@@ -98,14 +106,14 @@ class KeyframeBank:
             their start and goal pictures as the network is given them.
         :param keyframe: returns that of a number, uint8 (H, W, 3): of demonstration i the numbers
             i * levels and following; called for the chosen.
-        :param objects: see KeyframeBank, of all demonstrations.
+        :param objects: see KeyframeBank, of all demonstrations; weights: the same.
         :raises ImageError: see KeyframeBank.
         """
         most = max(1, min(MOST, MOST_BYTES // (levels * keyframe(0).nbytes)))
-        chosen = spread_out(ends, most)
+        chosen = spread_out(ends, most, weights)
         return cls(ends[chosen], [png_bytes(keyframe(i * levels + level))
                                   for i in chosen.tolist() for level in range(levels)],
-                   None if objects is None else objects[chosen])
+                   None if objects is None else objects[chosen], weights)
 
     @classmethod
     def take(cls, tensors: dict[str, torch.Tensor], path: str | Path) -> Self | None:
@@ -121,12 +129,13 @@ class KeyframeBank:
             return None
         try:
             ends, objects = own.pop(_ENDS).numpy(), own.pop(_OBJECTS, None)
+            weights = own.pop(_WEIGHTS).numpy() if _WEIGHTS in own else EQUAL
             files = [own.pop(f'{_KEYFRAME}{n}') for n in range(len(own))]
             if any(file.dtype != torch.uint8 or file.dim() != 1 for file in files):
                 raise ConfigError('expected each as the bytes of a file')
             return cls(ends, [file.numpy().tobytes() for file in files],
                        None if objects is None else objects.where(
-                           objects > NOWHERE, torch.nan).numpy())
+                           objects > NOWHERE, torch.nan).numpy(), weights)
         except (LookupError, TypeError, ConfigError, ImageError) as error:
             raise WeightsError(f'{escaped(path)}: its keyframes cannot be used: '
                                f'{escaped(error)}; copy it again, or train again') from error
@@ -135,7 +144,8 @@ class KeyframeBank:
         """Return what a weights file holds of it, by name."""
         known = {} if self._objects is None else {
             _OBJECTS: torch.from_numpy(self._objects).nan_to_num(NOWHERE)}
-        return {_ENDS: torch.from_numpy(self._ends), **known, **{
+        return {_ENDS: torch.from_numpy(self._ends), **known,
+                _WEIGHTS: torch.from_numpy(self._weights), **{
             f'{_KEYFRAME}{n}': torch.frombuffer(bytearray(file), dtype=torch.uint8)
             for n, file in enumerate(self._files)}}
 
@@ -152,10 +162,12 @@ class KeyframeBank:
         Find the most alike demonstrations, see retrieval.nearest_others.
 
         :param pictures: uint8 (B, 2, H, W, 3), start and goal as the network is given them.
-        :return: indices int64 (B,), and distances (B,), see retrieval.
+        :return: indices int64 (B,) by the weights, and distances (B,) of the nearest by equal
+            weights, which tell what is unlike everywhere.
         """
         asked = np.stack([ends_of(*pair) for pair in pictures])
-        indices, distances = nearest_others(asked, self._ends, 1)
+        indices, _ = nearest_others(asked, self._ends, 1, self._weights)
+        _, distances = nearest_others(asked, self._ends, 1)
         return indices[:, 0], distances[:, 0]
 
     def unlike(self, distance: float) -> str:

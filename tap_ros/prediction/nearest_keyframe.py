@@ -14,6 +14,8 @@ from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.protocol import check_request, Predictor, Request
 from tap_ros.prediction.retrieval import (
     ends_of,
+    EQUAL,
+    learned_weights,
     nearest_others,
     places_then,
     unlike,
@@ -34,7 +36,8 @@ class NearestKeyframe(Predictor):
     Show the median of the keyframes of the recorded episodes that are most alike.
 
     These are the NEIGHBOURS with the most alike start and goal pictures, but for the one that is
-    asked about, see retrieval.nearest_others; so recordings can be scored by themselves. Of each
+    asked about, see retrieval.nearest_others; so recordings can be scored by themselves. With
+    marks, what is alike is learned from the marked frames. Of each
     the keyframe is the one that is marked, the last where several are; without marks the frame
     half way from the first picture to the last, by what they show. With recursion it is the mark
     before, or half way to the keyframe before. Objects are where they were in the recordings, not
@@ -59,6 +62,9 @@ class NearestKeyframe(Predictor):
         self._ends = np.stack([ends_of(episode.frames[0], episode.frames[-1])
                                for episode in self._episodes])
         self._usual = usual_distance(self._ends)
+        self._weights = EQUAL if marks is None else learned_weights(self._ends, np.stack([
+            ends_of(*(episode.frames[self._keyframe(i, 1, 0)],) * 2)[0]
+            for i, episode in enumerate(self._episodes)]))
         height, width = self._episodes[0].frames.shape[1:3]
         self.image_size = (height, width)
         self.training: dict[str, Any] = {}
@@ -105,9 +111,10 @@ class NearestKeyframe(Predictor):
     def _answer(self, request: Request) -> list[Subgoal]:
         """Return the keyframes for one request, the earliest first."""
         pictures, pixels = check_request(request, self.mode, self.image_size)
-        indices, distances = nearest_others(ends_of(*pictures)[None], self._ends, NEIGHBOURS)
+        asked = ends_of(*pictures)[None]
+        indices, _ = nearest_others(asked, self._ends, NEIGHBOURS, self._weights)
         alike = [self._episodes[i] for i in indices[0]]
-        distance = float(distances[0, 0])
+        distance = float(nearest_others(asked, self._ends, 1)[1][0, 0])
         found, at = [], [len(episode) - 1 for episode in alike]
         for level in range(1, request.recursion_depth + 1):
             at = [self._keyframe(i, level, last) for i, last in zip(indices[0], at)]

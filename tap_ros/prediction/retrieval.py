@@ -3,18 +3,24 @@
 """
 Which demonstrations are most alike, by small pictures of their start and goal.
 
-Distances are root mean squares of the differences of pixels, 0 to 255. They are found in whole
-numbers, so that they are the same on every machine; of equal ones the first index comes first.
+Distances are root mean squares of the differences of pixels, 0 to 255, each pixel with a weight.
+They are found in whole numbers, so that they are the same on every machine; of equal ones the
+first index comes first. Weights are learned: demonstrations are alike whose keyframes are.
 """
 
 from collections.abc import Sequence
+import math
 
 import cv2
 import numpy as np
 
 SIDE = 16  # px of a small picture, whose pixels are the means of areas
 LARGEST = 255.0  # distance of white from black
+LARGEST_WEIGHT = 1000
+EQUAL = np.ones((2, SIDE, SIDE), np.int32)  # weights of the plain distance
 _ROWS = 256  # whose distances from all others are held at once
+_LEARNED_FROM = 128  # demonstrations at most
+_SHRINKAGE = 0.1  # of learned weights towards equal ones
 
 
 def ends_of(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -29,7 +35,8 @@ def ends_of(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
 
 
 def nearest(asked: np.ndarray, known: np.ndarray, count: int,
-            exclude: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+            exclude: Sequence[int] | np.ndarray | None = None,
+            weights: np.ndarray = EQUAL) -> tuple[np.ndarray, np.ndarray]:
     """
     Find the demonstrations that are most alike.
 
@@ -37,27 +44,29 @@ def nearest(asked: np.ndarray, known: np.ndarray, count: int,
     :param known: uint8 (N, 2, SIDE, SIDE, 3), start and goal of others, N of at least 1.
     :param count: of demonstrations for each question; fewer where there are fewer.
     :param exclude: (Q,) the index that each question must not find, for example its own.
+    :param weights: int32 (2, SIDE, SIDE) of the pixels, 0 to LARGEST_WEIGHT, not all 0.
     :return: their indices int64 (Q, count) and distances float64 (Q, count), the nearest first.
     """
     count = min(count, len(known) - (exclude is not None))
     columns = known.reshape(len(known), -1).astype(np.float64)  # which hold these sums exactly
-    squares = (columns ** 2).sum(1)
+    weight = weights.repeat(3).astype(np.float64)
+    squares = columns ** 2 @ weight
     indices = np.empty((len(asked), count), np.int64)
     distances = np.empty((len(asked), count))
     for at in range(0, len(asked), _ROWS):
         rows = asked[at:at + _ROWS].reshape(len(asked[at:at + _ROWS]), -1).astype(np.float64)
-        sums = (rows ** 2).sum(1)[:, None] + squares - 2 * rows @ columns.T
+        sums = (rows ** 2 @ weight)[:, None] + squares - 2 * (rows * weight) @ columns.T
         if exclude is not None:
             sums[np.arange(len(rows)), exclude[at:at + _ROWS]] = np.inf
         found = sums.argsort(1, kind='stable')[:, :count]
         indices[at:at + _ROWS] = found
         distances[at:at + _ROWS] = np.sqrt(
-            np.take_along_axis(sums, found, 1) / columns.shape[1])
+            np.take_along_axis(sums, found, 1) / weight.sum())
     return indices, distances
 
 
-def nearest_others(asked: np.ndarray, known: np.ndarray,
-                   count: int) -> tuple[np.ndarray, np.ndarray]:
+def nearest_others(asked: np.ndarray, known: np.ndarray, count: int,
+                   weights: np.ndarray = EQUAL) -> tuple[np.ndarray, np.ndarray]:
     """
     Find the demonstrations that are most alike, without the one that is asked about.
 
@@ -66,13 +75,14 @@ def nearest_others(asked: np.ndarray, known: np.ndarray,
 
     :return: as nearest; count is N - 1 at most, or 1.
     """
-    indices, distances = nearest(asked, known, count + 1)
+    indices, distances = nearest(asked, known, count + 1, weights=weights)
     columns = np.arange(max(1, min(count, len(known) - 1))) + (
         (distances[:, :1] == 0) & (len(known) > 1))
     return (np.take_along_axis(indices, columns, 1), np.take_along_axis(distances, columns, 1))
 
 
-def neighbours(ends: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def neighbours(ends: np.ndarray, count: int,
+               weights: np.ndarray = EQUAL) -> tuple[np.ndarray, np.ndarray]:
     """
     Find for each demonstration the others that are most alike; see nearest.
 
@@ -80,7 +90,48 @@ def neighbours(ends: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     :return: indices int64 (N, count) and distances (N, count), never of itself; count is N - 1 at
         most.
     """
-    return nearest(ends, ends, count, np.arange(len(ends)))
+    return nearest(ends, ends, count, np.arange(len(ends)), weights)
+
+
+def learned_weights(ends: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
+    """
+    Learn which pixels of start and goal tell what the keyframe shows.
+
+    The weights for which the squared distances of demonstrations come nearest to those of their
+    keyframes, by least squares, none negative, and a little drawn towards equal ones.
+
+    :param ends: uint8 (N, 2, SIDE, SIDE, 3).
+    :param keyframes: uint8 (N, ..., H, W, 3), of each demonstration one or several.
+    :return: int32 (2, SIDE, SIDE), as nearest takes them; equal ones for fewer than three
+        demonstrations, and where all are the same.
+    """
+    from scipy.optimize import nnls  # takes a moment to import
+    some = np.unique(np.linspace(0, len(ends) - 1, min(len(ends), _LEARNED_FROM)).astype(int))
+    one, other = np.triu_indices(len(some), 1)
+    shown = [_squares(part.reshape(len(some), -1, 3).astype(np.float32), one, other)
+             for part in (ends[some], _smaller(keyframes[some]))]
+    away, wanted = shown[0], shown[1].mean(1)
+    if len(some) < 3 or not away.any() or not wanted.any():
+        return EQUAL
+    away, wanted = away / away.mean(), wanted / wanted.mean()
+    sums = away.sum(1)
+    pull = math.sqrt(_SHRINKAGE * len(away))
+    found, _ = nnls(np.concatenate([away, pull * np.eye(away.shape[1])]), np.concatenate(
+        [wanted, np.full(away.shape[1], pull * (sums @ wanted) / (sums @ sums))]))
+    whole = np.round(found * (LARGEST_WEIGHT / max(found.max(), 1e-12))).astype(np.int32)
+    return whole.reshape(EQUAL.shape) if whole.any() else EQUAL
+
+
+def _squares(pictures: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return squared differences (pairs, P) of the pixels of pictures (N, P, 3)."""
+    return ((pictures[one] - pictures[other]) ** 2).mean(-1).astype(np.float64)
+
+
+def _smaller(pictures: np.ndarray) -> np.ndarray:
+    """Return pictures (N, ..., H, W, 3) with SIDE pixels a side, (N, n, SIDE, SIDE, 3)."""
+    return np.stack([[cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+                      for picture in row] for row in pictures.reshape(
+                          len(pictures), -1, *pictures.shape[-3:])])
 
 
 def usual_distance(ends: np.ndarray) -> float:
@@ -93,7 +144,7 @@ def usual_distance(ends: np.ndarray) -> float:
     return float(neighbours(ends, 1)[1].max()) if len(ends) > 1 else LARGEST
 
 
-def spread_out(ends: np.ndarray, count: int) -> np.ndarray:
+def spread_out(ends: np.ndarray, count: int, weights: np.ndarray = EQUAL) -> np.ndarray:
     """
     Choose demonstrations that cover all of them.
 
@@ -104,10 +155,11 @@ def spread_out(ends: np.ndarray, count: int) -> np.ndarray:
     if len(ends) <= count:
         return np.arange(len(ends))
     columns = ends.reshape(len(ends), -1).astype(np.float64)
-    chosen = [int(nearest(columns.mean(0).round()[None], columns, 1)[0][0, 0])]
+    chosen = [int(nearest(columns.mean(0).round()[None], columns, 1, weights=weights)[0][0, 0])]
     away = np.full(len(ends), np.inf)
     while len(chosen) < count:
-        away = np.minimum(away, ((columns - columns[chosen[-1]]) ** 2).sum(1))
+        away = np.minimum(
+            away, (columns - columns[chosen[-1]]) ** 2 @ weights.repeat(3).astype(np.float64))
         chosen.append(int(away.argmax()))
     return np.sort(chosen)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tap_ros.base.errors import ImageError
 from tap_ros.prediction.keyframe_bank import KeyframeBank, MOST_OBJECTS
-from tap_ros.prediction.retrieval import ends_of, neighbours
+from tap_ros.prediction.retrieval import ends_of, learned_weights, neighbours
 from tap_ros.recording.full_size import FullSize
 import torch
 
@@ -40,11 +40,12 @@ class Keyframes:
         self._labels = np.stack([preference[i].argmax(1) for i in rows])  # N, levels
         given = store if filled is None or not config.fill_context else filled
         self._ends = np.stack([ends_of(*given.frames(i)[[0, -1]]) for i in rows])
-        self._near = (neighbours(self._ends, NEIGHBOURS)[0] if len(episodes) > 1
-                      else np.zeros((1, 1), np.int64))
         shown = store if filled is None else filled
-        self._pictures = torch.from_numpy(np.stack([
-            shown.frames(i)[at] for i, at in zip(rows, self._labels)]))
+        pictures = np.stack([shown.frames(i)[at] for i, at in zip(rows, self._labels)])
+        self._pictures = torch.from_numpy(pictures)
+        self._weights = learned_weights(self._ends, pictures)
+        self._near = (neighbours(self._ends, NEIGHBOURS, self._weights)[0] if len(episodes) > 1
+                      else np.zeros((1, 1), np.int64))
 
     def draw(self, chosen: np.ndarray, rng: np.random.Generator) -> torch.Tensor:
         """Return uint8 (B, levels, H, W, 3), of each episode those of one of the most alike."""
@@ -60,7 +61,8 @@ class Keyframes:
         def shown(n: int) -> np.ndarray:
             return full.picture(int(self._episodes[n // levels]), int(self._labels.flat[n]))
 
-        choose = partial(KeyframeBank.choose, self._ends, objects=self._objects(), levels=levels)
+        choose = partial(KeyframeBank.choose, self._ends, objects=self._objects(), levels=levels,
+                         weights=self._weights)
         if self._filled is None:
             with suppress(ImageError):  # some cannot be read one by one, or cameras differ
                 return choose(shown)

@@ -93,6 +93,30 @@ def test_a_demonstration_is_shown_its_neighbour_and_never_itself(bank, ends, epi
     assert single.find(pairs)[0].tolist() == [0] * 20
 
 
+def test_what_is_alike_is_kept_in_the_weights_file(ends, episodes, tmp_path):
+    weights = np.zeros((2, 16, 16), np.int32)
+    weights[0, :8] = 7
+    made = lively_network(num_context=3, image_size=64)
+    made.bank = KeyframeBank.choose(ends, lambda i: full(episodes[i], 20), weights=weights)
+    save_weights(tmp_path / 'w.safetensors', made, 'predictor', made.config, {})
+    again = load_network(tmp_path / 'w.safetensors')[0].bank
+    pairs = np.stack([episode.frames[[0, -1]] for episode in episodes])
+    indices, distances = again.find(pairs)
+    assert (indices == neighbours(ends, 1, weights)[0][:, 0]).all()
+    assert (indices != neighbours(ends, 1)[0][:, 0]).any()
+    assert (distances == neighbours(ends, 1)[1][:, 0]).all()  # what is unlike, is so anywhere
+    tensors, metadata = load_tensors(tmp_path / 'w.safetensors')
+    for wrong in (-weights, 0 * weights, weights.astype(np.int64), weights[:1], weights * 200):
+        save_tensors(tmp_path / 'v.safetensors', {
+            **tensors, 'bank.weights': torch.from_numpy(np.ascontiguousarray(wrong))}, metadata)
+        with pytest.raises(WeightsError, match='keyframes cannot be used: .*weights of pixels'):
+            load_network(tmp_path / 'v.safetensors')
+    del tensors['bank.weights']  # of a file that was written before there were any
+    save_tensors(tmp_path / 'v.safetensors', tensors, metadata)
+    assert (load_network(tmp_path / 'v.safetensors')[0].bank.find(pairs)[0] == neighbours(
+        ends, 1)[0][:, 0]).all()
+
+
 def test_the_network_is_given_the_third_picture_by_whoever_asks(network, bank, episodes):
     predictor = SubgoalPredictor(network)
     chosen = [1, 4, 7]

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from tap_ros.prediction.retrieval import (
     ends_of,
+    EQUAL,
     LARGEST,
+    LARGEST_WEIGHT,
+    learned_weights,
     nearest,
     nearest_others,
     neighbours,
@@ -102,3 +105,37 @@ def test_what_is_chosen_covers_all(ends):
     assert reach[0] <= np.median(reach[1:])
     twins = np.concatenate([ends[:6], ends[:6]])
     assert len({i % 6 for i in spread_out(twins, 6)}) == 6
+
+
+def test_what_says_nothing_of_the_keyframe_is_learned_not_to_count(ends):
+    keyframes = np.stack([episode.frames[20] for episode in
+                          open_recordings([BAG], progress=False)])
+    disturbed = ends.copy()  # a light in a corner of the start, on or off
+    light = np.random.default_rng(0).integers(0, 2, 20) * 255
+    disturbed[:, 0, :4, :4] = light[:, None, None, None]
+    weights = learned_weights(disturbed, keyframes)
+    assert weights.dtype == np.int32 and weights.shape == EQUAL.shape
+    assert weights.min() >= 0 and weights.max() == LARGEST_WEIGHT
+    assert weights[0, :4, :4].mean() < weights.mean() / 4
+    small = np.stack([ends_of(one, one)[0] for one in keyframes]).astype(float)
+
+    def apart(**how):
+        """Return how far the keyframes of the most alike are, without the light."""
+        near = neighbours(disturbed, 1, **how)[0][:, 0]
+        return np.abs(small[near] - small).mean()
+
+    assert apart(weights=weights) < apart()
+    assert (learned_weights(ends[:2], keyframes[:2]) == EQUAL).all()  # they tell nothing
+    assert (learned_weights(ends[[0] * 5], keyframes[:5]) == EQUAL).all()
+    several = learned_weights(disturbed, np.stack([keyframes, keyframes], 1))
+    assert (several == weights).all()
+
+
+def test_a_pixel_counts_by_its_weight(ends):
+    weights = np.zeros_like(EQUAL)
+    weights[1, 3:9] = np.random.default_rng(0).integers(0, LARGEST_WEIGHT, (6, 16))
+    indices, distances = neighbours(ends, 3, weights)
+    squares = (np.square(ends[:, None].astype(float) - ends).mean(-1) * weights).sum((2, 3, 4))
+    np.fill_diagonal(squares, np.inf)
+    assert (indices == squares.argsort(1)[:, :3]).all()
+    assert np.allclose(distances, np.sqrt(np.sort(squares, 1)[:, :3] / weights.sum()))

@@ -13,7 +13,7 @@ from tap_ros.images.pixels import to_float
 from tap_ros.prediction.keyframe_bank import KeyframeBank
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.protocol import Request
-from tap_ros.prediction.retrieval import ends_of, neighbours
+from tap_ros.prediction.retrieval import ends_of, learned_weights, neighbours
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
 from tap_ros.training.batches import Pictures
@@ -46,8 +46,9 @@ def test_what_is_drawn_is_the_label_of_another_demonstration_that_is_alike(store
     labels = [int(n) // 2 for n in store.lengths]
     preference = [np.eye(int(n), dtype=np.float32)[[t]] for n, t in zip(store.lengths, labels)]
     keyframes, rng = Keyframes(store, episodes, preference, config), np.random.default_rng(0)
-    near = neighbours(np.stack([
-        ends_of(*store.frames(int(i))[[0, -1]]) for i in episodes]), NEIGHBOURS)[0]
+    ends = np.stack([ends_of(*store.frames(int(i))[[0, -1]]) for i in episodes])
+    near = neighbours(ends, NEIGHBOURS, learned_weights(ends, np.stack([
+        store.frames(int(i))[labels[i]] for i in episodes])))[0]
     shown = {i: {store.frames(int(episodes[j]))[labels[episodes[j]]].tobytes() for j in near[n]}
              for n, i in enumerate(episodes)}
     drawn = {i: set() for i in episodes}
