@@ -89,7 +89,8 @@ def run(args):
     """Collect, draw strips of the bottlenecks, score keyframes and trainings, write the page."""
     rows, strips = score_tasks(dict.fromkeys(args.tasks, args.seed), args.methods, args)
     if args.tasks == TASKS:
-        more = score_tasks(ASIDE, WITH_MARKS, args, 'aside/')
+        more = score_tasks(ASIDE, [one for one in args.methods if one in WITH_MARKS], args,
+                           'aside/')
         rows, strips = rows + more[0], strips + more[1]
     out = Path(args.out)
     write_rows(out / 'worlds.json', rows)
