@@ -7,8 +7,11 @@ Parameters come from config/tap_ros.yaml of the package or from params_file; for
 arm start with sim:=false.
 """
 
+from pathlib import Path
+
+from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import (
     EqualsSubstitution,
@@ -24,7 +27,7 @@ from launch_ros.substitutions import FindPackageShare
 
 def generate_launch_description():
     """Describe the nodes and the arguments of this file."""
-    record = LaunchConfiguration('record')
+    record, files = LaunchConfiguration('record'), LaunchConfiguration('params_file')
     return LaunchDescription([
         DeclareLaunchArgument(
             'params_file',
@@ -57,6 +60,7 @@ def generate_launch_description():
         DeclareLaunchArgument(
             'use_sim_time', default_value=LaunchConfiguration('sim'), choices=['true', 'false'],
             description='All but the simulation take the time from /clock.'),
+        OpaqueFunction(function=check, args=[files, LaunchConfiguration('rviz')]),
         start('sim_node', {
             'lock_step': typed('lock_step', bool), 'objects': typed('objects', str)},
             condition=IfCondition(LaunchConfiguration('sim'))),
@@ -77,6 +81,19 @@ def generate_launch_description():
             parameters=[{'use_sim_time': typed('use_sim_time', bool)}],
             condition=IfCondition(LaunchConfiguration('rviz'))),
     ])
+
+
+def check(context, params_file, rviz):
+    """Raise RuntimeError, before a node starts, for what is not there."""
+    file = params_file.perform(context)
+    if not Path(file).is_file():
+        raise RuntimeError(f'params_file: {file} is not there; nothing is started')
+    if rviz.perform(context) == 'true':
+        try:
+            get_package_prefix('rviz2')
+        except PackageNotFoundError as error:
+            raise RuntimeError('rviz: rviz2 is not installed; install it, or leave rviz out; '
+                               'nothing is started') from error
 
 
 def start(executable, parameters=None, condition=None):

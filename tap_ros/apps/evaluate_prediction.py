@@ -98,7 +98,7 @@ def run(args: Options) -> None:
     words = verdict(scores['prediction'], seen, *(
         ['all episodes, also those trained on'] if args.all else
         [] if training else ['scored episodes']))
-    if seen is None and not args.all:
+    if seen is None and training and not args.all:
         words.append('training episodes: they are not among these recordings, so nothing tells '
                      'whether they were memorised')
     print('\n'.join(words))

@@ -110,6 +110,7 @@ def run(args: Options) -> None:
             print(f'open {server.url} in a browser; marks go to {escaped(path)}; Ctrl-C ends',
                   flush=True)
             server.serve_forever()
+        server.marking.labels.close()
 
 
 def parse_names(text: str) -> list[str]:

@@ -33,6 +33,7 @@ class BackgroundLabels:
         self._films: dict[int, Film | None] = {}
         self._lock = threading.Lock()
         self._asked: Asked | None = None
+        self._thread: threading.Thread | None = None
         self.found: Mapping[int, Sequence[tuple[int, float]]] = {}
         self.is_busy = False
 
@@ -47,7 +48,15 @@ class BackgroundLabels:
             self._asked = marks, names
             if not self.is_busy:
                 self.is_busy = True
-                threading.Thread(target=self._work, daemon=True).start()
+                self._thread = threading.Thread(target=self._work, daemon=True)
+                self._thread.start()
+
+    def close(self) -> None:
+        """Wait until what is being found is found: a thread in a library cannot be cut off."""
+        with self._lock:
+            self._asked = None
+        if self._thread is not None:
+            self._thread.join()
 
     def _work(self) -> None:
         """Find labels until nothing is asked."""

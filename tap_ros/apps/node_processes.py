@@ -87,7 +87,7 @@ class NodeProcesses:
                 lines = self._log(name).read_text(errors='replace').strip().splitlines()
                 raise NodeEnded(
                     f'{name} ended with exit code {process.returncode}; the end of '
-                    f'{self._log(name)}:\n' + '\n'.join(lines[-5:]))
+                    f'{self._log(name)}: ' + '; '.join(lines[-5:]))
 
     def cpu_s(self, name: str) -> float:
         """Return the CPU time that a node has taken so far, s; Linux tells."""

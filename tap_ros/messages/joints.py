@@ -151,6 +151,7 @@ class JointHistory:
         self._states: dict[str, list[tuple[int, float, float]]] = {
             name: [] for name in self.names}
         self._late = dict.fromkeys(self.names, 0)  # stamps in a row that go back
+        self._others: list[str] = []  # joints that a message told of, and none of these
         self.received = -math.inf
 
     def add(self, message: Any, received: float, again: bool = False) -> bool:
@@ -162,8 +163,9 @@ class JointHistory:
         :param again: whether a state with a stamp that is known counts as received anew.
         :raises KinematicsError: for a position that no joint can have; such a message is not used.
         """
-        found = {name: position for name, position in decode_positions(message).items()
-                 if name in self._states}
+        told = decode_positions(message)
+        found = {name: told[name] for name in told if name in self._states}
+        self._others = [] if found else [*told]
         for name, position in found.items():
             if not abs(position) <= FARTHEST:
                 raise KinematicsError(f'{name} is at {position}; expected rad or m, at most '
@@ -222,7 +224,9 @@ class JointHistory:
         """Return position and reception of a joint at a time."""
         states = self._states[name]
         if not states:
-            raise KinematicsError(f'nothing is known of {name}')
+            raise KinematicsError(f'nothing is known of {name}' + (
+                f'; joint states tell of {listing(self._others)}; is the prefix of its joints '
+                'right?' if self._others else ''))
         after = bisect_left(states, stamp_ns, key=lambda known: known[0])
         before = _count_until(states, stamp_ns) - 1
         if before < 0:

@@ -139,7 +139,7 @@ def call(client: Client, request: Any, timeout_s: float,
     name, node = f'service {client.service_name}', 'its node' if server is None else server.name
     while not client.service_is_ready():
         if time.monotonic() >= deadline or give_up():
-            raise CallError(f'{name}: nobody offers it after {timeout_s:g} s; start {node} and '
+            raise CallError(f'{name}: nobody offers it after {timeout_s:.3g} s; start {node} and '
                             'wait until it says that it is ready')
         time.sleep(min(POLL_S, timeout_s))
     presence = None if server is None else server.presence()

@@ -229,7 +229,7 @@ class Reaching:
         deadline = time.monotonic() + accept_s
         while not self._goals.action.server_is_ready():
             if time.monotonic() >= deadline:
-                raise CallError(f'{self._name}: nobody offers it after {accept_s:g} s; start '
+                raise CallError(f'{self._name}: nobody offers it after {accept_s:.3g} s; start '
                                 f'{self._server.name}')
             time.sleep(POLL_S)
         self._presence = publishers_present(self._goals.node, STATUS)

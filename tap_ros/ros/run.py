@@ -17,6 +17,7 @@ from typing import Any
 import rclpy
 from rclpy import executors
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 from tap_ros.base.contract import NODE_CLASSES, OWNED
 from tap_ros.base.errors import TapError
 from tap_ros.base.text import escaped, listing
@@ -50,9 +51,13 @@ def main(name: str = '', args: list[str] | None = None) -> int:
 
     :param name: of the node, one of NODE_CLASSES; by default that of the executable.
     :param args: command-line arguments, None for those of the process.
-    :return: exit code: 1 when the node could not be started, or when close returns 1.
+    :return: exit code: 1 when the node could not be started, or when close returns 1; 0 after
+        --help.
     """
     name = name or Path(sys.argv[0]).name
+    if (said := usage(name, sys.argv[1:] if args is None else args)) is not None:
+        print(said, file=sys.stderr if said.startswith('error') else sys.stdout)
+        return int(said.startswith('error'))
     module, class_name = NODE_CLASSES[name].split(':')
     node_class = getattr(import_module(module), class_name)
     stop = threading.Event()
@@ -108,6 +113,17 @@ def main(name: str = '', args: list[str] | None = None) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return code
+
+
+def usage(name: str, args: list[str]) -> str | None:
+    """Return what is said instead of starting a node with such arguments; None: nothing."""
+    how = (f'{name} --ros-args -p NAME:=VALUE ..., or --ros-args --params-file FILE.yaml; all '
+           'parameters are in config/tap_ros.yaml')
+    with suppress(RuntimeError):  # of ROS arguments that cannot be parsed; rclpy.init says it
+        for one in remove_ros_args(['', *args])[1:]:
+            return f'usage: {how}' if one in ('-h', '--help') else (
+                f'error: argument {escaped(one, 60)} is unknown; expected {how}')
+    return None
 
 
 def _finish(executor: Any, seconds: float) -> None:

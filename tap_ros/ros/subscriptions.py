@@ -15,6 +15,7 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
@@ -27,6 +28,9 @@ OURS = NODE_CLASSES.keys() - {'sim_node'}  # nodes whose pictures are no camera'
 UNKNOWN = '_NODE_NAME_UNKNOWN_'  # of a publisher that was discovered before its node
 ADAPT_PERIOD = 0.5  # s between two comparisons with what is offered
 PROCESS_BYTES = 12  # of an endpoint's id, by which the endpoints of one process begin
+
+# rclpy would warn that nothing arrives, before it is subscribed anew and does.
+_QUIET = SubscriptionEventCallbacks(use_default_callbacks=False)
 
 Publishers = Mapping[str, Mapping[bytes, set[str]]]  # of each topic: {process: its nodes}
 
@@ -80,7 +84,7 @@ class AdaptiveSubscription:
     def _subscribe(self) -> None:
         self.subscription = self._node.create_subscription(
             self._type, self.topic, self._callback, self.qos, callback_group=self._group,
-            raw=self._raw)
+            event_callbacks=_QUIET, raw=self._raw)
 
 
 def adapt_regularly(node: Node, subscriptions: Iterable[AdaptiveSubscription],

@@ -209,5 +209,6 @@ def warn_if_few(held_out: np.ndarray) -> None:
     if len(held_out) < FEW:
         count = f'{len(held_out)} episode{" is" if len(held_out) == 1 else "s are"}'
         warnings.warn(f'recordings: only {count} held out, and scores of fewer than {FEW} say '
-                      'little; record more, give a larger --test-fraction, or --held-out BAG',
+                      'little; record more, or train with a larger --test-fraction or --held-out '
+                      'BAG',
                       RecordingWarning, stacklevel=3)

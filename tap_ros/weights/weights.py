@@ -66,7 +66,7 @@ def load_weights(path: str | Path,
     if about.get('kind') != kind:
         raise WeightsError(
             f'{escaped(path)}: holds weights of a {escaped(about.get("kind"))}, not of a {kind}; '
-            f'give the file of a training of the {kind.partition("_")[0]}')
+            f'give a file of `python -m tap_ros train {kind.partition("_")[0]}`')
     for part in ('config', 'training'):
         if not isinstance(about.get(part), dict):
             raise WeightsError(f'{escaped(path)}: does not say its {part}; train again')

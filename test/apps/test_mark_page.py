@@ -24,6 +24,7 @@ import pytest
 from tap_ros.__main__ import main
 from tap_ros.apps.label_command import Options, WholeReading
 from tap_ros.apps.mark_command import MarkServer, parse_names, words_of
+from tap_ros.apps.mark_labels import BackgroundLabels
 from tap_ros.apps.marking import Marking
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import only_keeper
@@ -325,6 +326,25 @@ def test_what_marks_is_in_sight_at_a_desk_and_on_a_phone_and_keys_press_what_the
                 shown = page.evaluate('episode')
                 page.click('#next')
                 page.wait_for_function(f'episode !== {shown}')
+
+
+def test_labels_that_are_being_found_are_waited_for_at_the_end(store, monkeypatch):
+    begun, found = threading.Event(), threading.Event()
+
+    def find(self, marks, names):
+        begun.set()
+        time.sleep(0.3)
+        found.set()
+        return {}
+
+    monkeypatch.setattr('tap_ros.apps.mark_labels.BackgroundLabels._find', find)
+    labels = BackgroundLabels(store, [0, 1])
+    labels.close()  # of a page on which nothing was marked
+    labels.ask({0: [3]}, ['grasp'])
+    assert begun.wait(10) and not found.is_set()
+    labels.ask({0: [4]}, ['grasp'])  # this one is given up
+    labels.close()
+    assert found.is_set() and not labels.is_busy
 
 
 @needs_browser

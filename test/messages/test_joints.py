@@ -84,6 +84,16 @@ def test_new_states_are_told_from_those_sent_again():
     assert not known.add(joints(120 * MS, other=1.0), 5)
 
 
+def test_joints_of_other_names_are_named():
+    known = JointHistory(['left_a', 'left_b'])
+    known.add(joints(100 * MS, a=1.0, b=2.0), 0)
+    with pytest.raises(KinematicsError, match='of left_a; joint states tell of a, b; is the pre'):
+        known.at(100 * MS, 1)
+    known.add(joints(100 * MS, left_b=1.0), 0)
+    with pytest.raises(KinematicsError, match='of left_a$'):
+        known.at(100 * MS, 1)
+
+
 def test_a_clock_that_goes_back_is_believed_when_it_says_so_again():
     known = history((5000, {'a': 1.0}), names='a')
     assert not known.add(joints(100 * MS, a=2.0), 1)

@@ -19,7 +19,7 @@ import tap_ros
 from tap_ros.apps.node_processes import errors_in
 from tap_ros.base.contract import CLIMB_LIMIT, MOVE_LIMIT, NODE_CLASSES
 from tap_ros.ros.parameters import MOUNT
-from tap_ros.ros.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
+from tap_ros.ros.run import configure_fast_dds, LOCALHOST, main, PROFILE, SUBNET, usage
 import yaml
 
 FILE = Path(__file__).parents[2] / 'config/tap_ros.yaml'
@@ -82,6 +82,19 @@ def test_what_the_user_has_chosen_is_kept():
         configure_fast_dds(variables)
         assert variables.get(PROFILE) == (profile and str(profile)), given
         assert variables.get(discovery) == reach, given
+
+
+@pytest.mark.parametrize('words, said', [
+    (['--help'], 'usage: sim_node --ros-args -p NAME:=VALUE'), (['-h'], 'usage: '),
+    (['--ros-args', '-p', 'task:=push3', '--', '--help'], 'usage: '),
+    (['-p', 'task:=push3'], 'error: argument -p is unknown; expected sim_node --ros-args -p '),
+    (['--ros-args', '-p', 'task:=push3', '-r', '__ns:=/a'], None), ([], None),
+    (['--ros-args', '-p', 'task'], None)])  # rclpy says what is wrong
+def test_what_a_node_does_not_know_is_answered_before_it_starts(words, said):
+    answer = usage('sim_node', words)
+    assert answer is None if said is None else answer.startswith(said)
+    if said:
+        assert main('sim_node', words) == int(said.startswith('error'))
 
 
 COMMAND = """

@@ -184,7 +184,7 @@ def objects(stamp, u=3.0, v=8.0):
 
 
 @pytest.mark.parametrize('group', [None, PollOnlyGroup()])
-def test_best_effort_and_volatile_publishers_are_heard(client, group):
+def test_best_effort_and_volatile_publishers_are_heard(client, group, capfd):
     heard = []
     camera, goal = Observations('image'), Observations('image', 'objects', latched=True)
     for seen, types, qos in (
@@ -205,6 +205,8 @@ def test_best_effort_and_volatile_publishers_are_heard(client, group):
                 publisher.publish(message)
             return camera.newest('image') and goal.newest('image', 'objects')
         assert until(came, pause=0.1)
+    said = capfd.readouterr().err
+    assert 'taken best_effort' in said and 'No messages will be received' not in said
 
 
 def test_what_was_latched_before_does_not_come_back(client):

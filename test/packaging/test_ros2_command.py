@@ -98,6 +98,20 @@ def test_nodes_run_and_answer_as_the_page_says(tmp_path, domain):
     assert list((tmp_path / 'bags' / 'mine').glob('*.mcap'))
 
 
+@pytest.mark.parametrize('argument, words', [
+    ('params_file:=mine.yaml', 'params_file: mine.yaml is not there'),
+    ('rviz:=true', 'rviz2 is not installed')])
+def test_a_launch_without_what_it_needs_starts_nothing(argument, words, tmp_path, domain):
+    if shutil.which('rviz2') and 'rviz' in argument:
+        pytest.skip('rviz2 is installed')
+    launch = Started(f'ros2 launch tap_ros nodes.launch.py {argument}', tmp_path, 'launch', domain)
+    try:
+        assert launch.process.wait(60) == 1
+    finally:
+        said = launch.end()
+    assert words in said and 'process started' not in said, said
+
+
 @pytest.mark.parametrize('space', ['', '/robot1'])
 def test_launch_files_start_what_they_say_in_any_namespace(space, tmp_path, domain):
     launch = Started('ros2 launch tap_ros nodes.launch.py' + (

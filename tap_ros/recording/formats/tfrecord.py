@@ -127,7 +127,7 @@ def _choose(features: dict[str, list[bytes]], camera: str) -> str:
     seen = [name for name, picture in first.items() if not _is_blank(picture)]
     if camera or len(seen) > 1 or not first:
         kind = RecordingError if camera or not first else ConfigError  # others may have it
-        raise kind(f'--camera: {escaped(camera)}; expected one of '
+        raise kind(f'--camera: {escaped(camera)}{"; " * bool(camera)}expected one of '
                    f'{listing(seen or first) or "those with pictures, but there are none"}')
     return (seen or list(first))[0]
 
