@@ -34,16 +34,12 @@ GOOD, GOOD_COST = 0.7, 0.35  # fit of what is believed; cost up to which no othe
 CLEARER = 0.03  # less cost of another than the likeliest pose
 MOST_COST = 0.4  # of what is found far from where it was
 NEW_COST, NEW_ANGLE, NEW_SEEN = 0.25, 0.35, 0.85  # from when on the object is cut out anew
-SHARED, GROWN = 0.8, 3.0  # of the part of an object that was known, in what is all of it; and
-# how much larger that is at most
-OFF, NEAR = 15.0, 0.25  # px from a click to the middle of what was cut out: farther, it may be two
-# objects; share of the way to that of these, or of half an object
+SHARED = 0.8  # of the part of an object that was known, in what is all of it
 UNSURELY = 0.8  # factor of the confidence in an object whose middle is not known
 WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
 RECURS = 0.6  # share of the colours of the first template in such a cut
 KEYS = 6  # templates of an object, the first among them
-BENEATH = 0.1  # m from where an object seems to be that lies on another, to that
 KEPT = 0.1  # weight of places where a goal picture shows nothing else
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
 MOST = (0.5, 1.8)  # of its area, that has to be there then
@@ -131,16 +127,14 @@ class RigidTracker:
 
     def _object(self, picture: Picture, cut: Cut, at: np.ndarray, angle: float = 0.0) -> _Object:
         """Return what is known of an object that was cut out around a pixel."""
-        plane = picture.plane
+        plane, sure = picture.plane, cut.sure(at)
+        # Of half an object, or two witnesses that contradict each other: half way.
+        way = 0.0 if not self._snap else 1.0 if sure else 0.5
         middle = plane.places(centre(top_face(cut.mask, plane)))
-        near = np.linalg.norm(plane.pixels(middle, MIDDLE) - at) < OFF
-        sure = bool(cut.whole and near)
-        way = 0.0 if not self._snap else 1.0 if sure else NEAR
         place = way * middle + (1 - way) * plane.places(at, MIDDLE)
         first, face = (Template(picture.by(cut.metric), cut.mask, place, angle, top)
                        for top in (False, True))
-        return _Object(place, [first], face, first, angle, sure=sure,
-                       part=bool(near and not cut.whole))
+        return _Object(place, [first], face, first, angle, sure=sure, part=not cut.whole)
 
     def update(self, view: View) -> Tracked:
         picture = Picture(view, self._plane, self._first)
@@ -163,14 +157,6 @@ class RigidTracker:
                      for k, face in enumerate(faces) if k not in found}
             best = min(tried, key=lambda k: tried[k].cost)
             found[best] = tried[best]
-        upper = [pose for pose in found.values() if pose.confidence > SURE]
-        covered = self._drawn(picture, upper)
-        for k, pose in found.items():
-            if pose.confidence <= SURE and self._plane.calibrated:
-                key = self._objects[k].keys[0]
-                lower = Matcher(picture.by(key.metric), covered).locate(key, region=region)
-                if any(np.linalg.norm(lower.place - other.place) < BENEATH for other in upper):
-                    found[k] = lower
         poses, plane = [found[k] for k in range(len(faces))], self._plane
         confidence = np.array([pose.confidence for pose in poses])
         places, sure = np.reshape([pose.place for pose in poses], (-1, 3)), confidence > SURE
@@ -254,14 +240,10 @@ class RigidTracker:
 
     def _covered(self, one: _Object, picture: Picture) -> np.ndarray:
         """Return what hides an object: the robot, and the others where they are seen."""
-        return self._drawn(picture, [other for other in self._objects
-                                     if other is not one and other.state == SEEN])
-
-    def _drawn(self, picture: Picture, others: Sequence[_Object | Pose]) -> np.ndarray:
-        """Return what hides objects: the robot, and others."""
         covered = picture.hidden.astype(np.uint8)
-        for other in others:
-            cv2.fillPoly(covered, [np.rint(self._outline(other)).astype(np.int32)], 1)
+        for other in self._objects:
+            if other is not one and other.state == SEEN:
+                cv2.fillPoly(covered, [np.rint(self._outline(other)).astype(np.int32)], 1)
         return covered > 0
 
     def _still(self, one: _Object, before: Picture, now: Picture) -> bool:
@@ -282,25 +264,22 @@ class RigidTracker:
         """
         outline = self._outline(one)
         before = cv2.fillPoly(np.zeros(picture.size, np.uint8), [np.rint(outline).astype(int)], 1)
-        if not one.part and share(before, picture.hidden):
+        if share(before, picture.hidden):
             return
         one.waits = WAITS
         at, *others = self._plane.pixels([one.place, *(
             other.place for other in self._objects if other is not one)], MIDDLE)
         radius = 1.4 * float(np.linalg.norm(outline - at, axis=1).max()) + 4
         cut = silhouette(picture, at, others, 0.0 if one.part else radius)
-        if not one.part and share(cut.mask, picture.hidden):
+        if share(cut.mask, picture.hidden):
             return
-        grown = cut.mask.sum() / one.keys[0].area
-        if not one.part and 0.6 < grown < 1.6 and (
+        if not one.part and 0.6 < cut.mask.sum() / one.keys[0].area < 1.6 and (
                 one.keys[0].palette.recurs(
                     picture.index[cut.mask], one.keys[0].indices) > RECURS):
             key = Template(picture, cut.mask, one.place, one.angle)
             one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
-        elif one.part and grown < GROWN and before[cut.mask].sum() > SHARED * before.sum():
-            found = self._object(picture, cut, at, one.angle)
-            if found.sure:
-                self._objects[self._objects.index(one)] = found
+        elif one.part and cut.sure(at) and before[cut.mask].sum() > SHARED * before.sum():
+            self._objects[self._objects.index(one)] = self._object(picture, cut, at, one.angle)
 
     def _tracked(self) -> Tracked:
         """Return where the objects are."""

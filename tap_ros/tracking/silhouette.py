@@ -24,8 +24,9 @@ LEAST_AREA = 48  # px; more than CORE, which is taken for the object whatever it
 LEAST_CONTRAST = 7.0  # of the object's colours and the table's, for a click to be believed
 COLOURFUL = 12.0  # contrast of colour without which lightness tells an object, too
 SPREAD = 1.5  # by which it exceeds what colours of the ring differ from the table's, median
-NEARER, CLEARER = 3.0, 1.5  # px by which another cut is better, and the factor of its contrast
-TOUCHING = 0.1  # share of an outline at the robot, without which it is all of the object
+OFF, NEARER, CLEARER = 9.0, 3.0, 1.5  # px from a click to the middle that is doubted, by which
+# another cut is better, and the factor of its contrast
+TOUCHING = 0.15  # share of an outline at the robot, without which it is all of the object
 ENDS = 0.04  # the same at the end of the search, which is to be widened
 SHARED = 0.1  # share of a cut that is in another one, too, without which they do not touch
 _RINGS = (0.75, 1.3)  # of the radius, between which the table is seen
@@ -38,11 +39,16 @@ class Cut:
     mask: np.ndarray  # (h, w) bool, all False where nothing differs
     contrast: float  # how its colours differ from those around, median; 0: as those themselves
     metric: Metric  # by which they do
-    whole: bool  # its outline borders neither the robot nor the end of the search; a shadow may
+    whole: bool  # its outline borders neither the robot nor the end of the search
+    touched: bool = False  # only what has colours as under the click: others touch it
 
     def off(self, at: np.ndarray) -> float:
         """Return the distance of its middle from a pixel, inf where nothing was cut out."""
         return float(np.linalg.norm(centre(self.mask) - at)) if self.mask.any() else np.inf
+
+    def sure(self, at: np.ndarray) -> bool:
+        """Return whether it is all of an object that was clicked at a pixel, and nothing else."""
+        return self.whole and not self.touched and self.off(at) < OFF
 
 
 def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.ndarray = (),
@@ -65,7 +71,7 @@ def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | 
         alone = _cut(picture, at, others, near, alone=True)
         if (alone.off(at) < cut.off(at) - NEARER and cut.contrast < SURE
                 and alone.contrast > CLEARER * cut.contrast):
-            cut = alone
+            cut = replace(alone, touched=True)
     return cut
 
 
@@ -126,13 +132,9 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
         np.where(parts > 0, far, np.inf).argmin()])
     whole[window] = part
     contrast, colour = (float(np.median(one[part])) for one in (unlike, hue))
-    robot = picture.hidden.astype(np.uint8)  # in its shadow the table is seen
-    robot[window] &= unlike > POSSIBLE
-    ends = (cv2.morphologyEx(robot, cv2.MORPH_OPEN, SQUARE) > 0) | _beyond(
-        picture, at, radius - 2)
     believed = contrast > SPREAD * np.median(unlike[ring])
     return Cut(whole, contrast if believed else 0.0, COLOUR if colour > COLOURFUL else LIGHT,
-               share(whole, ends) <= TOUCHING)
+               share(whole, picture.hidden | _beyond(picture, at, radius - 2)) <= TOUCHING)
 
 
 def _beyond(picture: Picture, at: np.ndarray, radius: float) -> np.ndarray:

@@ -143,29 +143,6 @@ def test_half_an_object_keeps_near_the_click_until_it_is_seen_whole():
     assert np.abs(found.pixels - STARTS).max() < 1 and found.confidence.min() > 0.9
 
 
-def shaded():
-    """Return a View in which the robot's shadow, part of its mask, reaches the first object."""
-    view, bar = draw(STARTS), draw(STARTS).image != draw([]).image
-    view.robot_mask[60:130, 50:90][~bar.any(-1)[60:130, 50:90]] = 255
-    view.image[view.robot_mask > 0] //= 2
-    return view
-
-
-@pytest.mark.parametrize('off', [6, 12])
-@pytest.mark.parametrize('make', [shaded, lambda: draw(STARTS)])
-def test_a_click_beside_the_middle_is_taken_there_also_where_a_shadow_ends(off, make):
-    tracker = load_plugin('tap_ros.trackers', 'rigid')(None)
-    found = tracker.select(make(), np.array(STARTS) + (off, 0))
-    assert np.abs(found.pixels - STARTS).max() < 1 and found.confidence.min() > 0.9
-
-
-def test_half_an_object_is_corrected_where_the_shadow_reaches_it():
-    tracker = load_plugin('tap_ros.trackers', 'rigid')(None)
-    tracker.select(draw(STARTS, robot=(82, 70, 130, 130)), [(79.0, 101.0), STARTS[1]])
-    found = tracker.update(shaded())
-    assert np.abs(found.pixels - STARTS).max() < 1 and found.confidence.min() > 0.9
-
-
 @pytest.mark.parametrize('light', [(0.6, 0.6, 0.6), (1.1, 1.0, 0.8)])
 def test_other_light_changes_nothing(tracker, light):
     moved = np.array(STARTS) + 4
@@ -326,20 +303,6 @@ def test_what_the_hand_carries_is_followed_through_the_air(task, seed):
     off = np.linalg.norm([one.pixels for one in found] - episode.object_pixels[1:], axis=-1)
     assert (episode.object_poses[..., 2] > 0.12).sum() > 2 and off.max() < 8
     assert all(one.states[-1] == SEEN for one in found)
-
-
-def test_what_lies_under_another_object_is_found_in_a_goal_picture_by_its_sides():
-    simulator = Simulator('stack2', 256)
-    try:
-        episode = simulator.demonstrate(70_005).episode
-        tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
-            simulator.camera_matrix, (256, 256), simulator.camera_pose))
-    finally:
-        simulator.close()
-    tracker.select(View(episode.frames[0], episode.robot_masks[0]), episode.object_pixels[0])
-    found = tracker.find(View(episode.goal_frame, episode.goal_mask))
-    assert found.states == (SEEN, SEEN)
-    assert np.abs(found.pixels - episode.goal_pixels).max() < 4
 
 
 @pytest.mark.parametrize('place, along', [
