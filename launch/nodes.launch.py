@@ -9,7 +9,6 @@ arm start with sim:=false.
 
 from pathlib import Path
 
-from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
@@ -90,8 +89,8 @@ def check(context, params_file, rviz):
         raise RuntimeError(f'params_file: {file} is not there; nothing is started')
     if rviz.perform(context) == 'true':
         try:
-            get_package_prefix('rviz2')
-        except PackageNotFoundError as error:
+            FindPackageShare('rviz2').perform(context)
+        except LookupError as error:
             raise RuntimeError('rviz: rviz2 is not installed; install it, or leave rviz out; '
                                'nothing is started') from error
 

@@ -303,9 +303,9 @@ class McapFile:
         if self._stopped is not None:
             self.defects.append(Defect(
                 (f'the file is cut off at byte {self._stopped} of {self._size}'
-                 if self._stopped < self._size else 'the file ends within a record, or is being '
-                 'recorded') + '; what is whole before that is used; copy it again if it was cut '
-                'by copying',
+                 if self._stopped < self._size else 'the file is cut off within a record, or is '
+                 'being recorded') + '; what is whole before that is used; copy it again if it '
+                'was cut by copying',
                 start=None if end is None else end + 1, end=end))
         elif self._needs_summary:
             self.defects.append(Defect('its summary is damaged, so that nothing tells whether all '
