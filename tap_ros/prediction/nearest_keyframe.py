@@ -63,8 +63,7 @@ class NearestKeyframe(Predictor):
                                for episode in self._episodes])
         self._usual = usual_distance(self._ends)
         self._weights = EQUAL if marks is None else learned_weights(self._ends, np.stack([
-            ends_of(*(episode.frames[self._keyframe(i, 1, 0)],) * 2)[0]
-            for i, episode in enumerate(self._episodes)]))
+            episode.frames[self._keyframe(i, 1, 0)] for i, episode in enumerate(self._episodes)]))
         height, width = self._episodes[0].frames.shape[1:3]
         self.image_size = (height, width)
         self.training: dict[str, Any] = {}

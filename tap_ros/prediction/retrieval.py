@@ -30,8 +30,12 @@ def ends_of(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
     :param start: uint8 (H, W, 3) of any size; goal: uint8 (h, w, 3), also of another size.
     :return: uint8 (2, SIDE, SIDE, 3).
     """
-    return np.stack([cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-                     for picture in (start, goal)])
+    return np.stack([_smaller(start), _smaller(goal)])
+
+
+def _smaller(picture: np.ndarray) -> np.ndarray:
+    """Return a picture (H, W, 3) with SIDE pixels a side."""
+    return cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
 
 
 def nearest(asked: np.ndarray, known: np.ndarray, count: int,
@@ -108,9 +112,11 @@ def learned_weights(ends: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
     from scipy.optimize import nnls  # takes a moment to import
     some = np.unique(np.linspace(0, len(ends) - 1, min(len(ends), _LEARNED_FROM)).astype(int))
     one, other = np.triu_indices(len(some), 1)
-    shown = [_squares(part.reshape(len(some), -1, 3).astype(np.float32), one, other)
-             for part in (ends[some], _smaller(keyframes[some]))]
-    away, wanted = shown[0], shown[1].mean(1)
+    small = np.stack([_smaller(picture) for picture in keyframes[some].reshape(
+        -1, *keyframes.shape[-3:])])
+    away, shown = (_squares(part.reshape(len(some), -1, 3).astype(np.float32), one, other)
+                   for part in (ends[some], small))
+    wanted = shown.mean(1)
     if len(some) < 3 or not away.any() or not wanted.any():
         return EQUAL
     away, wanted = away / away.mean(), wanted / wanted.mean()
@@ -125,13 +131,6 @@ def learned_weights(ends: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
 def _squares(pictures: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return squared differences (pairs, P) of the pixels of pictures (N, P, 3)."""
     return ((pictures[one] - pictures[other]) ** 2).mean(-1).astype(np.float64)
-
-
-def _smaller(pictures: np.ndarray) -> np.ndarray:
-    """Return pictures (N, ..., H, W, 3) with SIDE pixels a side, (N, n, SIDE, SIDE, 3)."""
-    return np.stack([[cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-                      for picture in row] for row in pictures.reshape(
-                          len(pictures), -1, *pictures.shape[-3:])])
 
 
 def usual_distance(ends: np.ndarray) -> float:

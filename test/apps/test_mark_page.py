@@ -329,11 +329,11 @@ def test_what_marks_is_in_sight_at_a_desk_and_on_a_phone_and_keys_press_what_the
 
 
 def test_labels_that_are_being_found_are_waited_for_at_the_end(store, monkeypatch):
-    begun, found = threading.Event(), threading.Event()
+    begun, end, found = (threading.Event() for _ in range(3))
 
     def find(self, marks, names):
         begun.set()
-        time.sleep(0.3)
+        assert end.wait(60)
         found.set()
         return {}
 
@@ -343,6 +343,7 @@ def test_labels_that_are_being_found_are_waited_for_at_the_end(store, monkeypatc
     labels.ask({0: [3]}, ['grasp'])
     assert begun.wait(10) and not found.is_set()
     labels.ask({0: [4]}, ['grasp'])  # this one is given up
+    threading.Timer(0.2, end.set).start()
     labels.close()
     assert found.is_set() and not labels.is_busy
 
