@@ -40,6 +40,7 @@ WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
 RECURS = 0.6  # share of the colours of the first template in such a cut
 KEYS = 6  # templates of an object, the first among them
+BENEATH = 0.1  # m from where an object seems to be that lies on another, to that
 KEPT = 0.1  # weight of places where a goal picture shows nothing else
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
 MOST = (0.5, 1.8)  # of its area, that has to be there then
@@ -157,6 +158,14 @@ class RigidTracker:
                      for k, face in enumerate(faces) if k not in found}
             best = min(tried, key=lambda k: tried[k].cost)
             found[best] = tried[best]
+        over = [pose for pose in found.values() if pose.confidence > SURE]
+        for k, pose in found.items():
+            if pose.confidence <= SURE and self._plane.calibrated:  # its sides may show
+                key = self._objects[k].keys[0]
+                pose = Matcher(picture.by(key.metric), self._drawn(picture, over)).locate(
+                    key, region=region)
+                if any(np.linalg.norm(pose.place - other.place) < BENEATH for other in over):
+                    found[k] = pose
         poses, plane = [found[k] for k in range(len(faces))], self._plane
         confidence = np.array([pose.confidence for pose in poses])
         places, sure = np.reshape([pose.place for pose in poses], (-1, 3)), confidence > SURE
@@ -240,10 +249,14 @@ class RigidTracker:
 
     def _covered(self, one: _Object, picture: Picture) -> np.ndarray:
         """Return what hides an object: the robot, and the others where they are seen."""
+        return self._drawn(picture, [other for other in self._objects
+                                     if other is not one and other.state == SEEN])
+
+    def _drawn(self, picture: Picture, others: Sequence[_Object | Pose]) -> np.ndarray:
+        """Return the pixels (h, w) bool of the robot and of others."""
         covered = picture.hidden.astype(np.uint8)
-        for other in self._objects:
-            if other is not one and other.state == SEEN:
-                cv2.fillPoly(covered, [np.rint(self._outline(other)).astype(np.int32)], 1)
+        for other in others:
+            cv2.fillPoly(covered, [np.rint(self._outline(other)).astype(np.int32)], 1)
         return covered > 0
 
     def _still(self, one: _Object, before: Picture, now: Picture) -> bool:

@@ -305,6 +305,20 @@ def test_what_the_hand_carries_is_followed_through_the_air(task, seed):
     assert all(one.states[-1] == SEEN for one in found)
 
 
+def test_what_lies_under_another_object_is_found_in_a_goal_picture_by_its_sides():
+    simulator = Simulator('stack2', 256)
+    try:
+        episode = simulator.demonstrate(70_005).episode
+        tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
+            simulator.camera_matrix, (256, 256), simulator.camera_pose))
+    finally:
+        simulator.close()
+    tracker.select(View(episode.frames[0], episode.robot_masks[0]), episode.object_pixels[0])
+    found = tracker.find(View(episode.goal_frame, episode.goal_mask))
+    assert found.states == (SEEN, SEEN)
+    assert np.abs(found.pixels - episode.goal_pixels).max() < 4
+
+
 @pytest.mark.parametrize('place, along', [
     ((0, -1, TOP), (0, 1, 0)), ((0, 0, 1), (0, 0, 1)), ((0, -1, 0.1), (0, 1, 0)),
     ((0, 0, -1), (0, 0, 1)), ((90, 0, 1), (0, 0, -1))])
