@@ -11,6 +11,7 @@ from experiments.paper import published
 from experiments.paper import rows as rows_of_scores
 from experiments.paper.results import load_runs, on_same_episodes
 from experiments.paper.rows import as_frame, group_runs, make_rows
+from experiments.real import WAYS
 from experiments.tables import (
     find,
     FIX,
@@ -23,9 +24,10 @@ from experiments.tables import (
     STACKING,
 )
 from experiments.worlds import command
+import numpy as np
 from pandas import read_csv
 import pytest
-from tap_ros.evaluation.intervals import Interval
+from tap_ros.evaluation.intervals import Interval, share_interval
 
 ROOT = RESULTS.parents[1]
 README = (ROOT / 'README.md').read_text()
@@ -114,3 +116,11 @@ def test_the_sentences_of_the_readme_are_those_of_the_data():
     gain = find(RESULTS, PREDICTION, task='push2', method=GENMIN, **GAIN)['value']
     assert (f"the error is {gain:.0%} below a fixed time's (the paper reports "
             f'{published.GAINS["push2"]:.0%})') in text
+    real = json.loads((RESULTS / 'real.json').read_text())['30']
+    (error, _, off), (keyframe_error, _, keyframe_off) = (
+        np.concatenate(real[way], 1) for way in (WAYS['three'][0], 'most alike keyframes'))
+    right = share_interval(off <= 1 + 1e-3)
+    assert (f'In {right.value:.0%} ({100 * right.low:.0f} to {100 * right.high:.0f}) of 40 '
+            'held-out demonstrations the predicted moment is within 1 s') in text
+    assert np.mean(keyframe_off <= 1 + 1e-3) >= right.value
+    assert f'have {keyframe_error.sum() / error.sum():.1f} times the error' in text
