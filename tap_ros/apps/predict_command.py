@@ -106,10 +106,12 @@ def run(args: Options) -> None:
     (left, top, *extent), names = windows['start'], object_names(len(places['start']))
     for subgoal in subgoals:
         print(f'{_title(subgoal, len(subgoals))}{":" if len(places["start"]) else ""}')
-        for name, where, mass in zip(names, subgoal.expected_pixels, subgoal.mass):
+        for name, where, mass, undecided in zip(
+                names, subgoal.expected_pixels, subgoal.mass, subgoal.undecided):
             u, v = (where + 0.5) * extent / subgoal.image.shape[1::-1] - 0.5 + (left, top)
             faint = f', but hardly in the picture: {mass:.0%} of it' if mass < FAINT else ''
-            print(f'  {name} at {u:.1f},{v:.1f}{faint}')
+            doubt = ', undecided: the mean of more than one place' if undecided else faint
+            print(f'  {name} at {u:.1f},{v:.1f}{doubt}')
     write_atomically(args.out, labelled(parts, places, subgoals))
     print(f'written: {escaped(args.out)}')
     if not names:

@@ -15,6 +15,9 @@ from tap_ros.messages.images import decode_image, decode_map, image_fields, map_
 from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import header_fields, Stamp
 
+NEAR = 1 / 16  # of the width: all within this of the largest value of a map is one place
+ELSEWHERE = 0.25  # of a map: from this share beyond that on there is another one
+
 
 @dataclass(frozen=True)
 class Subgoal:
@@ -43,6 +46,15 @@ class Subgoal:
     level: int
     distance: float = math.nan
     warning: str = ''
+
+    @property
+    def undecided(self) -> np.ndarray:
+        """Whether the map of each object shows it in more than one place, bool (K,)."""
+        K, h, w = self.object_maps.shape
+        peaks = self.object_maps.reshape(K, h * w).argmax(1)[:, None, None]
+        y, x = np.ogrid[:h, :w]
+        far = np.hypot(x - peaks % w, y - peaks // w) > NEAR * w
+        return np.asarray((self.object_maps * far).sum((1, 2)) > ELSEWHERE)
 
 
 def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int, frame_id: str,

@@ -375,7 +375,7 @@ def test_a_hand_that_moves_proposes_nothing_without_labels_and_what_is_marked_st
         assert page.is_visible('#accept') and page.evaluate('frame') == 3
         page.evaluate('go(1)')
         page.keyboard.press('1')
-        assert page.inner_text('#accept') == 'accept 1.5 s (a)', 'what is marked stays'
+        assert page.inner_text('#accept') == 'accept release 1.5 s (a)', 'what is marked stays'
         page.keyboard.press('a')
         page.wait_for_function('Object.keys(state.marks).length === 4 && isSaved()')
         assert page.is_hidden('#accept')

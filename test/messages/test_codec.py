@@ -181,6 +181,17 @@ def test_a_subgoal_carries_the_stamp_and_frame_of_the_picture_and_may_have_no_ob
     assert decoded.object_maps.shape == (0, *SIZE) and decoded.expected_pixels.shape == (0, 2)
 
 
+@pytest.mark.parametrize('shares, undecided', [
+    ((1, 0), False), ((0.8, 0.2), False), ((0.7, 0.3), True), ((0.5, 0.5), True)])
+def test_a_map_of_two_places_is_undecided(shares, undecided):
+    maps = np.zeros((2, 64, 64), np.float32)
+    maps[:, 20, 20], maps[0, 20, 23] = (1, 0.5), 0
+    maps[1, 20, 20], maps[1, 40, 30] = shares
+    one = replace(subgoal(0, 1), object_maps=maps)
+    assert one.undecided.tolist() == [False, undecided]
+    assert replace(one, object_maps=maps[:0]).undecided.tolist() == []
+
+
 def test_maps_may_be_bytes_or_left_out_unless_they_are_needed():
     sent, names = subgoal(0, 1), (*NAMES, 'lost')
     sent = replace(sent, object_maps=np.concatenate([sent.object_maps, np.zeros((1, *SIZE))]),

@@ -141,6 +141,7 @@ def test_an_object_that_is_dragged_is_brought_there_via_a_subgoal(explored, brow
         assert re.fullmatch(r'via subgoal: .* cm from their goals \(\d+ steps\)',
                             newest(page))
         assert explored.away() < SUCCESS_DISTANCE
+        assert 'of an earlier picture' in page.inner_text('#step-predict')
         reset(page)
         page.wait_for_function('!pictures.subgoal && !pictures.plan')
         blank = page.evaluate("""() => ['subgoal', 'plan'].every((kind) => {
@@ -173,7 +174,7 @@ def test_what_cannot_be_done_is_said_moves_nothing_and_is_no_error_of_a_node(exp
         assert 'cancelled' in newest(page)
         assert page.is_enabled('#cancel') and page.is_enabled('#direct')
         page.click('#cancel')
-        page.wait_for_function("/no goal/.test($('error').textContent)")
+        page.wait_for_function("/nothing is in progress/.test($('error').textContent)")
         assert not [each for each in state(page)['nodes'] if each['state'] == 'wrong']
 
 

@@ -136,6 +136,9 @@ def test_samples_and_levels_are_told_apart_and_repeat_from_the_seed(services):
         seen = pictures(response)
         assert all(differ(seen[i], seen[j]) > 3 for i in range(6) for j in range(i))
         assert response.message.startswith(f'{mode}, 6 subgoals, maps of cup, box')
+        doubtful = np.any([one.undecided for one in decode_subgoals(response, NAMES)], 0)
+        told = response.message.partition('undecided about ')[2].partition(':')[0]
+        assert told == ', '.join(name for name, doubt in zip(NAMES, doubtful) if doubt)
         for subgoal in response.subgoals:
             assert subgoal.header.stamp == STAMP and subgoal.header.frame_id == 'eye'
             assert tuple(subgoal.object_names) == NAMES

@@ -136,6 +136,7 @@ class Options:
                    if load_plugin('tap_ros.tasks', task).kind == 'push']
         for task in self.tasks if self.world == TABLE else ():
             if task not in pushing:
+                load_plugin('tap_ros.tasks', task)  # else it is none, and what is meant is told
                 raise ConfigError(f'task {task}: is not one of those that push, '
                                   f'{", ".join(pushing)}; see it with explore --task {task}')
 

@@ -144,7 +144,7 @@ class ExplorerCalls:
         with self._lock:
             if do == 'cancel':
                 if not self.running:
-                    raise CommandError('there is no goal to cancel')
+                    raise CommandError('nothing is in progress that could be cancelled')
                 self._cancelled = True  # also one that is about to begin
                 if self._goal is not None:
                     self._goal.cancel()
@@ -213,7 +213,8 @@ class ExplorerCalls:
                               u=[float(one['u']) for one in objects],
                               v=[float(one['v']) for one in objects])
         self._display.select(response, followed=True)
-        self._display.events.add(escaped(response.message, 1000))
+        self._display.events.add(escaped(response.message, 1000),
+                                 problem=len(response.objects) < len(objects))
 
     def _propose(self) -> None:
         response = self._call('select', propose=True)
@@ -275,8 +276,8 @@ class ExplorerCalls:
         self._display.events.add(f'{words}: begun')
         result = goal.result()
         end = 'cancelled' if result.end == 'cancelled' else plain(escaped(result.message, 1000))
-        end = f'{words}: {end} ({result.steps} steps)'
         spent = result.end == 'succeeded' and not result.success
+        end = f'{words}: {end}' + ('' if spent else f' ({result.steps} steps)')
         self.forget_end(end, result.success, spent)
         self._display.events.add(end)
 

@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 from functools import cache
+from itertools import compress
 import json
 import math
 import threading
@@ -86,6 +87,18 @@ class Display:
             self.warn(error)
             return {}
 
+    def subgoal(self) -> str:
+        """Say what the newest subgoal tells, '' without one."""
+        message, _ = self.newest.get('subgoal', (None, 0.0))
+        try:
+            names = [] if message is None else list(compress(
+                message.object_names, decode_subgoal(message, message.object_names).undecided))
+        except TapError:
+            return ''  # its picture is not shown, either
+        if names:
+            return f'undecided about {listing(names)}: predict again, or go directly'
+        return 'the subgoal is there'
+
     def size(self, kind: str) -> dict[str, int]:
         """Return width and height of the newest picture of a kind; 0 without one."""
         return dict(zip(('width', 'height'), self.sizes.get(kind, (0, 0))))
@@ -128,9 +141,9 @@ def points_of(outline: Any) -> list[list[float]]:
 def silence(now: float, newest: tuple[Any, float] | None) -> str:
     """Return since when a topic is silent, in steps that do not change with every look."""
     if newest is None:
-        return 'nothing has come yet'
+        return 'has sent nothing yet'
     age = now - newest[1]
-    return f'silent for {age:.0f} s' if age > SILENT_S else ''
+    return f'has been silent for {age:.0f} s' if age > SILENT_S else ''
 
 
 @cache

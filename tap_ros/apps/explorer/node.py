@@ -59,6 +59,8 @@ class ExplorerNode(Node):
         self._task = self.params['task']
         self._seed: int | None = None  # of the scene, once it is told
         self._scenes = 0  # that have begun
+        # The newest subgoal, in words; whether the arm has moved since.
+        self._subgoal, self._passed = '', False
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
         kind, topic = camera_image(self.params)
         self._diagnostics = Diagnostics(
@@ -112,6 +114,10 @@ class ExplorerNode(Node):
                     self._calls.forget_end()
                 if name in OF_A_SCENE and self._is_old(message):
                     return
+                if name == 'objects' and before and _names(before) != _names(message):
+                    self._forget('subgoal', 'plan')  # they are of other objects
+                if name == 'subgoal':
+                    self._passed = False
                 if name == 'goal_objects' and before and _places(before) != _places(message):
                     self._calls.forget_end()  # of a goal that somebody has moved since
                 newest[name] = message, reception_time(info)
@@ -165,6 +171,7 @@ class ExplorerNode(Node):
         calls, shown = self._calls, self._display
         running = calls.running
         stage = calls.stage if running else ''
+        self._passed |= running
         self._server.put('selection', shown.selection)
         shown.events.look()
         self._server.put('events', shown.events.text)
@@ -177,6 +184,8 @@ class ExplorerNode(Node):
             if image is not None:
                 shown.sizes[kind] = image.shape[1], image.shape[0]
                 self._server.put(kind, picture_bytes(image, kind == 'plan'))
+        if 'subgoal' in changed:
+            self._subgoal = shown.subgoal()
         objects, goals = shown.places('objects'), shown.places('goal_objects')
         now, simulator, tracker = (
             time.monotonic(), calls.offered('reset'), calls.offered('select'))
@@ -192,7 +201,10 @@ class ExplorerNode(Node):
                        'objects': display.listed(
                            objects, newest.get('objects', [None])[0], shown.outlines.copy()),
                        'targets': display.listed({n: goals[n] for n in objects if n in goals}),
-                       'note': display.silence(now, newest.get('camera'))},
+                       'note': display.silence(now, newest.get('camera')),
+                       'objects_note': display.silence(now, newest.get('objects'))},
+            'subgoal': ('of an earlier picture' if self._passed and not running
+                        else self._subgoal),
             'goal': {**shown.size('goal'),
                      'objects': display.listed(goals, newest.get('goal_objects', [None])[0]),
                      'pictured': 'goal' in newest},
@@ -212,6 +224,10 @@ class ExplorerNode(Node):
         if not objects or (self._calls.offered('reset') and not self._calls.offered('select')):
             return ''
         return 'goal' if pictured else 'camera'
+
+
+def _names(message: ObjectStates) -> set[str]:
+    return {one.name for one in message.objects}
 
 
 def _places(message: ObjectStates) -> list[tuple[str, float, float]]:

@@ -46,7 +46,7 @@ function accepted() {
   return set.every((t, k) => !k || t > set[k - 1]) ? frames : draft;
 }
 
-const added = () => accepted().filter((t, k) => t !== (draft[k] ?? null));
+const added = () => accepted().map((t, k) => [t, k]).filter(([t, k]) => t !== (draft[k] ?? null));
 
 function show(t) {
   const last = state.lengths[episode] - 1;
@@ -72,9 +72,9 @@ function draw() {
   $('play').textContent = playing ? 'Stop' : 'Play';
   const listed = draft.map((t, k) => t === null ? `${nameOf(k)} not yet` : `${nameOf(k)} ${second(t)}`);
   const guess = labels().map(([t, sure], k) => `${names()[k] || ''} ${second(t)} (${Math.round(100 * sure)}%)`);
-  $('title').textContent = `Demonstration ${episode} (0 to ${state.lengths.length - 1}): ` +
+  $('title').textContent = `Demonstration ${episode}, of 0 to ${state.lengths.length - 1}: ` +
     (given().length ? listed.join(', ') + (isSaved() ? '' : ' (not saved)') : 'nothing marked') + (guess.length ? `; label: ${guess.join(', ')}` : '');
-  $('file').textContent = `saved at once in ${state.file}`;
+  $('file').textContent = `saved ${names().length > 1 ? 'once each name is marked' : 'at once'}, in ${state.file}`;
   drawTicks(last);
   for (const one of $('strip').children) {
     const inside = (t) => Number(one.dataset.first) <= t && t <= Number(one.dataset.last);
@@ -86,7 +86,7 @@ function draw() {
     button(names().length ? `${k + 1} ${name}` : name, () => mark(names().length ? k : null)), {className: k === free ? 'main' : ''}));
   const offer = added();
   $('accept').hidden = !offer.length;
-  $('accept').textContent = `accept ${offer.map(second).join(', ')} (a)`;
+  $('accept').textContent = `accept ${offer.map(([t, k]) => `${nameOf(k)} ${second(t)}`.trim()).join(', ')} (a)`;
   fill($('list'), Object.entries(state.marks), ([i, frames]) => made('li', {className: Number(i) === episode ? 'here' : ''},
     button(`${i}: ${state.seconds[i].map((s) => `${s.toFixed(1)} s`).join(', ')}`, () => { visit(Number(i), frames[0]); })));
   if (!count) $('list').append(made('li', {className: 'soft'}, 'What you mark is listed here.'));
@@ -97,7 +97,7 @@ function draw() {
 
 // The ticks of a demonstration: [frame, kind, text]; a label until its mark is there.
 function ticks() {
-  return [...about.moves.map(([t, closes]) => [t, 'move', closes === null ? 'hand' : closes ? 'closes' : 'opens']),
+  return [...about.moves.map(([t, closes]) => [t, 'move', closes === null ? 'hand' : `gripper ${closes ? 'closes' : 'opens'}`]),
     ...labels().map(([t], k) => [t, 'label', `${names()[k] || 'label'}?`]).filter((_, k) => (draft[k] ?? null) === null),
     ...draft.flatMap((t, k) => t === null ? [] : [[t, isSaved() ? 'mark' : 'draft', nameOf(k)]])];
 }
@@ -193,7 +193,7 @@ function send(frames) {
 function accept() {
   playing = false;
   say('');
-  const [first] = added();
+  const [[first] = []] = added();
   if (first === undefined) { say('Nothing is proposed here.'); return; }
   send(accepted());
   show(first);

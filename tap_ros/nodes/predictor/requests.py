@@ -5,6 +5,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import compress
 import math
 import time
 from typing import Any
@@ -226,6 +227,10 @@ def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],
                     'and all samples would be the same')
     message += ''.join(f'; {warning}' for warning in {
         subgoal.warning: None for subgoal in subgoals if subgoal.warning})
+    undecided = np.any([subgoal.undecided for subgoal in subgoals], 0)
+    if undecided.any():
+        message += (f'; undecided about {listing(compress(task.names, undecided))}: expected in '
+                    'more than one place')
     return PredictSubgoal.Response(
         success=True, message=message, model_time_ms=elapsed_ms,
         subgoals=[encode_subgoal(

@@ -97,7 +97,7 @@ class TrackerNode(Node):
     def _on_episode(self) -> None:
         with self._lock:
             if self._selection is not None and self._ended(self._selection):
-                self._forget('a new episode has begun')
+                self._forget('a new episode has begun', expected=True)
 
     def _on_select(self, request: SelectObjects.Request,
                    response: SelectObjects.Response) -> SelectObjects.Response:
@@ -280,15 +280,19 @@ class TrackerNode(Node):
                 return f'{CAMERA_INFO.name} or {CAMERA_POSE.name} has changed'
         return ''
 
-    def _forget(self, why: str) -> None:
+    def _forget(self, why: str, expected: bool = False) -> None:
         """Follow nothing any more."""
         self._selection = None
         if self._found_ns is not None:
             self._goal_objects.publish(encode_objects(
                 (), np.empty((0, 2)), None, self._found_ns, '', ObjectStates.SOURCE_TRACKED))
             self._found_ns = None
-        self.get_logger().warning(
-            f'the selected objects are forgotten: {why}; select them again')
+        said = f'the selected objects are forgotten: {why}; select them again'
+        # On two lines: ROS refuses one that logs in two severities.
+        if expected:
+            self.get_logger().info(said)
+        else:
+            self.get_logger().warning(said)
 
     def _log_states(self, selection: Selection, tracked: Tracked) -> None:
         """Log which objects are known less well than before, and which well again."""
@@ -296,8 +300,7 @@ class TrackerNode(Node):
         for name, before, now in zip(selection.names, selection.tracked.states, tracked.states):
             if now == before or {before, now} <= {*usual}:
                 continue
-            # On two lines: ROS refuses one that logs in two severities.
-            if now in usual:
+            if now in usual:  # on two lines, see _forget
                 self.get_logger().info(f'{escaped(name)} is {now}')
             else:
                 self.get_logger().warning(f'{escaped(name)} is {now}')

@@ -19,7 +19,7 @@ function connect() {
     `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/socket${location.search}`);
   socket.binaryType = 'arraybuffer';
   socket.onclose = () => {
-    showRun('no connection; trying again', 'bad');
+    showRun('no connection: does the explorer still run? Trying again', 'bad');
     if (state) showState();
     setTimeout(connect, RECONNECT_MS);
   };
@@ -86,10 +86,10 @@ function showRun(text, mark) {
 function progress() {
   const {camera, goal, run, tracker, simulator} = state;
   const count = camera.objects.length, missing = missingGoals();
-  const camera_why = !camera.width ? 'waits for the camera' : camera.note && `the camera is ${camera.note}`;
+  const camera_why = !camera.width ? 'waits for the camera' : camera.note && `the camera ${camera.note}`;
   const goal_why = goal.pictured ? '' : 'needs a goal picture: step 3';
   const place_why = missing.length ? `needs the goal of ${missing.join(', ')}: step 3` : '';
-  const predict_why = camera_why || goal_why || place_why || (!state.predictor && 'needs the predictor, which does not run');
+  const predict_why = camera_why || goal_why || (tracker && !count && 'needs objects: step 2') || place_why || (!state.predictor && 'needs the predictor, which does not run');
   const go_why = !state.plans ? `nothing plans how to grasp: for ${state.task} subgoals are predicted only`
     : camera_why || (!count && 'needs objects: step 2') || place_why
     || (!state.planner && 'needs the planner, which does not run');
@@ -100,19 +100,19 @@ function progress() {
     scene: [!camera_why && known, camera_why || (!known ? '' : !simulator ? `${camera.width}x${camera.height} pixels`
       : state.seed === null ? state.task : `${state.task}, seed ${state.seed}`), camera_why],
     objects: [count > 0 && !anew, selecting() ? clicked : !count ? untracked() ? 'waits for objects: start tracker_node' : 'waits for objects'
-      : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} known`, camera_why],
+      : camera.objects_note ? `their tracker ${camera.objects_note}` : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
       ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
       : count && missing.length ? `drag to ${missing.length > 1 ? 'their goals' : 'its goal'}: ${missing.join(', ')}` : goal.pictured ? 'the picture is there' : 'placed by hand',
     camera_why],
-    predict: [Boolean(pictures.subgoal), pictures.subgoal ? 'the subgoal is there' : predict_why || 'can be predicted now', predict_why],
+    predict: [Boolean(pictures.subgoal), pictures.subgoal ? state.subgoal : predict_why || 'can be predicted now', predict_why],
     go: [run.reached, run.running ? run.stage : run.end || go_why || 'the arm can go now', go_why]};
 }
 
 function showState() {
   const {run, goal} = state, done = progress(), on = connected();
   if (on && run.running) showRun(run.stage.split(', plan')[0] || 'starting', 'busy');
-  else if (on) showRun(done.scene[2] || 'the arm stands still', done.scene[2] ? '' : 'good');
+  else if (on) showRun(done.scene[2] || (state.planner ? 'the arm stands still' : 'no planner runs'), done.scene[2] || !state.planner ? '' : 'good');
   document.body.classList.toggle('running', on && run.running);
   lead(run.running || run.reached ? 'go' : STEPS.find((one) => !done[one][0] && done[one][1]) ?? 'go', run.running || run.end);
   for (const one of STEPS) {
@@ -129,7 +129,7 @@ function showState() {
   const busy = !on ? 'there is no connection' : run.running ? 'the arm moves: wait for its end, or cancel' : '';
   for (const id of ['task', 'seed']) allow(id, busy);
   allow('another', busy || (!$('task').value && 'choose a task'));
-  allow('start', busy || (!($('task').value && $('seed').value) && 'choose a task and a seed'));
+  allow('start', busy || (!($('task').value && /^\d+$/.test($('seed').value)) && 'choose a task, and a whole number as seed'));
   allow('propose', busy || done.objects[2] || (!goal.pictured && 'needs a goal picture'),
     'what differs between the picture of now and the goal');
   allow('follow', busy || done.objects[2] || (!clicks.length && 'click on the objects first'), 'they are followed from now on');
@@ -148,10 +148,10 @@ function showState() {
   $('follow').textContent = clicks.length ? `use ${clicks.length > 1 ? 'these' : 'this'} ${objectCount(clicks.length)}` : 'use these objects';
   $('view-observer').parentElement.hidden = !state.observer;
   listObjects();
-  const wrong = state.nodes.filter((one) => one.state === 'wrong').length;
+  const [wrong, waits] = ['wrong', 'waits'].map((how) => state.nodes.filter((one) => one.state === how).length);
   $('nodes').className = wrong ? 'wrong' : '';
-  $('nodes').querySelector('span').textContent = wrong
-    ? `${wrong} of ${state.nodes.length} with a problem` : `all ${state.nodes.length} work`;
+  $('nodes').querySelector('span').textContent = !on ? 'not known' : wrong ? `${wrong} of ${state.nodes.length} with a problem`
+    : waits ? `all ready, ${waits} of ${state.nodes.length} wait` : 'all work';
   fill($('nodes').querySelector('tbody'), state.nodes, (one) => made('tr', {className: one.state},
     made('td', {textContent: one.name}), made('td', {textContent: one.text})));
   $('large').className = view === 'camera' && selecting() ? 'click' : movable() ? 'drag' : '';
@@ -163,7 +163,7 @@ function showState() {
 
 /* Goes to the step that is to be done, once, and once its picture is there; moves: whether the arm moves there, or has. */
 function lead(now, moves) {
-  const at = `${now} ${moves || Boolean(pictures[VIEW[now]])}`;
+  const at = `${now} ${moves ? `moves: ${moves}` : Boolean(pictures[VIEW[now]])}`;
   if (at === step) return;
   step = at;
   for (const one of STEPS) {
@@ -186,12 +186,13 @@ function hint() {
         : 'Photograph the objects where they are to be, put them back, then click the middle of each.';
   }
   const missing = missingGoals(), moves = movable();
+  const searched = missing.every((name) => state.goal.objects.some((one) => one.name === name));
   return {
     camera: untracked() ? 'Start tracker_node to click on objects here.' : `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
-    goal: moves && missing.length ? `Not found in this picture: ${missing.join(', ')}. Drag each to where it shows it.`
+    goal: moves && missing.length ? (searched ? 'Not found in this picture' : 'Looking here for') + `: ${missing.join(', ')}. ${searched ? 'Drag each to its place here.' : ''}`
       : `What the table is to look like.${moves ? ' Drag an object to change that.' : ''}`,
-    subgoal: 'The predicted picture in between: each object glows where it is expected then.',
-    plan: 'Ways of the fingertips that the planner considered; bold: the chosen one.',
+    subgoal: 'The predicted picture in between' + (state.camera.objects.length ? ': each object glows where it is expected then.' : '.'),
+    plan: 'Paths of the fingertips that the planner considered; bold: the chosen one.',
     observer: "The camera's view, with the whole arm."}[view];
 }
 
