@@ -19,7 +19,7 @@ import numpy as np
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.pushes import Route
 from sim_bridge.tasks.motions import direction
-from sim_bridge.world.camera import Camera, Renderer
+from sim_bridge.world.camera import Camera, load_triton, Renderer
 from tap_ros.base.contract import (
     CAMERA_SIZE,
     CONTROL_PERIOD,
@@ -169,6 +169,7 @@ def to_ours(place: np.ndarray) -> np.ndarray:
 
 def _make_env() -> Any:
     """Return the environment."""
+    load_triton()  # OGBench draws, too
     try:
         from ogbench.manipspace.envs.cube_env import CubeEnv
     except ModuleNotFoundError as error:

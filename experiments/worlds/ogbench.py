@@ -11,7 +11,7 @@ from importlib import import_module
 
 import numpy as np
 from sim_bridge.demonstrations import demonstrate
-from sim_bridge.world.camera import Camera, Renderer
+from sim_bridge.world.camera import Camera, load_triton, Renderer
 from sim_bridge.world.gap import Gap
 from tap_ros.base.errors import ConfigError, SceneError
 
@@ -118,6 +118,7 @@ class OGBench:
 
 def _make_env(task):
     """Return the environment, and the oracle of a task."""
+    load_triton()  # OGBench draws, too
     try:
         from ogbench.manipspace.envs.cube_env import CubeEnv
         from ogbench.manipspace.envs.puzzle_env import PuzzleEnv

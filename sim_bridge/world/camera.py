@@ -104,6 +104,12 @@ class OneCamera:
         return self.camera.pose
 
 
+def load_triton() -> None:
+    """Load triton, if torch's CUDA build brings it: its LLVM has to come before that of Mesa."""
+    with contextlib.suppress(ImportError):
+        import triton  # noqa: F401
+
+
 class Renderer(mujoco.Renderer):  # type: ignore[misc]  # MuJoCo has no types
     """
     Draws off-screen without what is slow there, in 7 ms, not 300; belongs to its thread.
@@ -116,9 +122,7 @@ class Renderer(mujoco.Renderer):  # type: ignore[misc]  # MuJoCo has no types
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int,
                  most_geoms: int = 10_000) -> None:
-        # Torch's CUDA build brings triton, whose LLVM has to be loaded before that of Mesa.
-        with contextlib.suppress(ImportError):
-            import triton  # noqa: F401
+        load_triton()
         model.vis.quality.offsamples = model.vis.quality.shadowsize = 0
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         try:
