@@ -157,5 +157,4 @@ class Simulator(Table):
             if not (np.abs(place) <= limit).all():  # not a number is no place either
                 raise SceneError(
                     f'{name}: its goal would be at x {place[0]:.3f} m, y {place[1]:.3f} m, out '
-                    f'of reach; in {task.name} objects are pushed to |x| and |y| of at most '
-                    f'{limit:g} m')
+                    f'of reach; expected within {limit:g} m of the middle, along x and y')

@@ -96,7 +96,7 @@ class Display:
         except TapError:
             return ''  # its picture is not shown, either
         if names:
-            return f'undecided about {listing(names)}: predict again, or go directly'
+            return f'undecided about {listing(names)}'
         return 'the subgoal is there'
 
     def size(self, kind: str) -> dict[str, int]:
