@@ -40,8 +40,8 @@ class Row(NamedTuple):
 
 
 CLEARLY = 0.1  # m from its goal, directly: no near miss
-COLUMNS = ('task', 'scenes', 'final cm, direct', 'via', 'nearer by', 'success, direct', 'via',
-           'more by, points')
+COLUMNS = ('task', 'scenes', 'cm left, direct', 'via subgoal', 'nearer by', 'succeed, direct',
+           'via subgoal', 'more, points')
 
 
 def summary(scenes: Sequence[Scene]) -> list[Row]:
@@ -64,13 +64,13 @@ def _row(label: str, scenes: Sequence[Scene]) -> Row:
 def in_words(row: Row) -> str:
     """Say what came of some scenes."""
     direct, via = row.reached
-    sure = 'its interval excludes zero' if row.nearer.low > 0 else 'which chance may explain'
+    chance = '' if row.nearer.low > 0 else ', which chance may explain'
     if row.scenes == 1:
         return (f'One scene, which proves nothing: objects end {row.nearer.value:.1f} cm nearer '
                 'to their goals via the predicted subgoal.')
     return (f'Via the predicted subgoal {via} of {row.scenes} scenes succeed, directly {direct}; '
-            f'objects end {row.nearer.value:.1f} cm nearer to their goals '
-            f'({row.nearer.low:.1f} to {row.nearer.high:.1f}), {sure}.')
+            f'objects end on average {row.nearer.value:.1f} cm nearer to their goals '
+            f'(95% interval {row.nearer.low:.1f} to {row.nearer.high:.1f}){chance}.')
 
 
 def results_table(rows: Sequence[Row]) -> str:
