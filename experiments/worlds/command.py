@@ -7,6 +7,7 @@ Demonstrations of other simulators, keyframes of them, and predictors trained on
 """
 
 from dataclasses import dataclass
+import json
 from pathlib import Path
 import re
 from typing import Literal, NamedTuple
@@ -93,10 +94,17 @@ def run(args):
                            'aside/')
         rows, strips = rows + more[0], strips + more[1]
     out = Path(args.out)
+    rows = merged(out / 'worlds.json', rows)
     write_rows(out / 'worlds.json', rows)
     write_atomically(out / 'worlds.md', page(rows))
     cv2.imwrite(str(out / 'worlds.png'), grid(strips)[..., ::-1])
     print(out / 'worlds.md')
+
+
+def merged(file, rows):
+    """Return the rows of a file, if it is there, with new ones in place of those they repeat."""
+    old = json.loads(file.read_text()) if file.exists() else []
+    return list({(row['task'], row['method']): row for row in [*old, *rows]}.values())
 
 
 def score_tasks(tasks, methods, args, prefix=''):
@@ -262,6 +270,8 @@ def compare(rows):
                    if row['method'] == method and row.get('seeds', 0) > 1}
                   for method in WITH_MARKS)
     tasks = [task for task in three if task in two]
+    if not tasks:
+        return {}
     found, alone = {'tasks': len(tasks)}, {}
     for name in ('hit', 'near'):
         gains = [_less(three[task][name], two[task][name]) for task in tasks]

@@ -69,6 +69,16 @@ def test_three_pictures_are_compared_with_two_over_tasks_of_several_trainings():
     found = command.compare(rows)
     assert found['tasks'] == 2 and found['hit'] == found['near'] == '+5 (-10 to +20)'
     assert found['alone'] == dict.fromkeys(('hit', 'near'), ['one +20 (+6 to +34)'])
+    assert command.compare(rows[::2]) == {}
+
+
+def test_one_method_alone_leaves_what_others_have_scored(tmp_path):
+    file, old = tmp_path / 'rows.json', [
+        {'task': 'a', 'method': method, 'hit': 1} for method in ('marks', 'three pictures')]
+    assert command.merged(file, old[:1]) == old[:1]
+    file.write_text(json.dumps(old))
+    new = [{'task': 'a', 'method': 'marks', 'hit': 2}, {'task': 'b', 'method': 'marks', 'hit': 3}]
+    assert command.merged(file, new) == [new[0], old[1], new[1]]
 
 
 def test_some_tasks_alone_have_a_page():
