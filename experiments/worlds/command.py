@@ -94,7 +94,8 @@ def run(args):
                            'aside/')
         rows, strips = rows + more[0], strips + more[1]
     out = Path(args.out)
-    rows = merged(out / 'worlds.json', rows)
+    if args.tasks == TASKS:  # one table
+        rows = merged(out / 'worlds.json', rows)
     write_rows(out / 'worlds.json', rows)
     write_atomically(out / 'worlds.md', page(rows))
     cv2.imwrite(str(out / 'worlds.png'), grid(strips)[..., ::-1])

@@ -110,8 +110,8 @@ def run(args: Options) -> None:
                 names, subgoal.expected_pixels, subgoal.mass, subgoal.undecided):
             u, v = (where + 0.5) * extent / subgoal.image.shape[1::-1] - 0.5 + (left, top)
             faint = f', but hardly in the picture: {mass:.0%} of it' if mass < FAINT else ''
-            doubt = ', undecided: the mean of more than one place' if undecided else faint
-            print(f'  {name} at {u:.1f},{v:.1f}{doubt}')
+            doubt = ', the mean: no single place is expected' * bool(undecided)
+            print(f'  {name} at {u:.1f},{v:.1f}{doubt}{faint}')
     write_atomically(args.out, labelled(parts, places, subgoals))
     print(f'written: {escaped(args.out)}')
     if not names:

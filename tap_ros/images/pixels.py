@@ -64,8 +64,8 @@ def check_image(image: object, name: str, size: Sequence[int] | None = None) -> 
     if size is not None and image.shape[:2] != tuple(size):
         raise ImageError(
             f'{name}: expected {size[1]}x{size[0]} pixels (width x height), '
-            f'got {image.shape[1]}x{image.shape[0]}; cut out a part of that '
-            'shape, scale it, or use weights for that size')
+            f'got {image.shape[1]}x{image.shape[0]}; cut and scale it '
+            'to that, or use weights for its size')
     return image
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 from tap_ros.base.contract import MAP_ENCODING
 from tap_ros.base.errors import PlanningError
@@ -15,8 +16,8 @@ from tap_ros.messages.images import decode_image, decode_map, image_fields, map_
 from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import header_fields, Stamp
 
-NEAR = 1 / 16  # of the width: all within this of the largest value of a map is one place
-ELSEWHERE = 0.25  # of a map: from this share beyond that on there is another one
+NEAR = 1 / 16  # of the width: the radius of one place
+ELSEWHERE = 0.25  # of a map: what is decided has less outside of its likeliest place
 
 
 @dataclass(frozen=True)
@@ -49,12 +50,12 @@ class Subgoal:
 
     @property
     def undecided(self) -> np.ndarray:
-        """Whether the map of each object shows it in more than one place, bool (K,)."""
-        K, h, w = self.object_maps.shape
-        peaks = self.object_maps.reshape(K, h * w).argmax(1)[:, None, None]
-        y, x = np.ogrid[:h, :w]
-        far = np.hypot(x - peaks % w, y - peaks // w) > NEAR * w
-        return np.asarray((self.object_maps * far).sum((1, 2)) > ELSEWHERE)
+        """Whether the map of each object is spread out or has several places, bool (K,)."""
+        radius = max(1, round(NEAR * self.object_maps.shape[2]))
+        y, x = np.mgrid[-radius:radius + 1, -radius:radius + 1]
+        place = (np.hypot(x, y) <= radius).astype(np.float32)
+        return np.array([cv2.filter2D(one, -1, place, borderType=cv2.BORDER_CONSTANT).max()
+                         < 1 - ELSEWHERE for one in self.object_maps], bool)
 
 
 def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int, frame_id: str,

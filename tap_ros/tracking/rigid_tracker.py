@@ -158,14 +158,15 @@ class RigidTracker:
                      for k, face in enumerate(faces) if k not in found}
             best = min(tried, key=lambda k: tried[k].cost)
             found[best] = tried[best]
-        over = [pose for pose in found.values() if pose.confidence > SURE]
+        over, beneath = [pose for pose in found.values() if pose.confidence > SURE], list[Pose]()
         for k, pose in found.items():
             if pose.confidence <= SURE and self._plane.calibrated:  # its sides may show
                 key = self._objects[k].keys[0]
                 pose = Matcher(picture.by(key.metric), self._drawn(picture, over)).locate(
-                    key, region=region)
+                    key, [other.place for other in beneath], region)
                 if any(np.linalg.norm(pose.place - other.place) < BENEATH for other in over):
                     found[k] = pose
+                    beneath.append(pose)
         poses, plane = [found[k] for k in range(len(faces))], self._plane
         confidence = np.array([pose.confidence for pose in poses])
         places, sure = np.reshape([pose.place for pose in poses], (-1, 3)), confidence > SURE

@@ -192,6 +192,14 @@ def test_a_map_of_two_places_is_undecided(shares, undecided):
     assert replace(one, object_maps=maps[:0]).undecided.tolist() == []
 
 
+def test_a_map_is_decided_wherever_its_place_is_and_undecided_where_it_is_spread_out():
+    maps = np.zeros((3, 64, 64), np.float32)
+    maps[0, [20, 22, 24, 25, 26], 5] = maps[1, [44, 42, 40, 39, 38], 5] = 0.2
+    maps[2] = 1 / 64 ** 2
+    one = replace(subgoal(0, 1), object_maps=maps)
+    assert one.undecided.tolist() == [False, False, True]
+
+
 def test_maps_may_be_bytes_or_left_out_unless_they_are_needed():
     sent, names = subgoal(0, 1), (*NAMES, 'lost')
     sent = replace(sent, object_maps=np.concatenate([sent.object_maps, np.zeros((1, *SIZE))]),

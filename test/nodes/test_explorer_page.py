@@ -139,7 +139,7 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
             assert not {'predict', 'direct', 'subgoal-run'} & {*page.evaluate(LIVE)}
             page.reload()
             page.wait_for_function(
-                "$('hint').textContent.startsWith('Looking here for: object_0, ring.')")
+                "$('hint').textContent.startsWith('No goal known yet for: object_0, ring.')")
             assert says(page, 'goal') == 'drag to their goals: object_0, ring'
         page.wait_for_function("/silent/.test($('step-scene').textContent)")
         assert 'photograph' not in page.evaluate(LIVE)

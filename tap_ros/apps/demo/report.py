@@ -64,7 +64,7 @@ def _row(label: str, scenes: Sequence[Scene]) -> Row:
 def in_words(row: Row) -> str:
     """Say what came of some scenes."""
     direct, via = row.reached
-    chance = '' if row.nearer.low > 0 else ', which chance may explain'
+    chance = ', which chance may explain' if row.nearer.low <= 0 <= row.nearer.high else ''
     if row.scenes == 1:
         return (f'One scene, which proves nothing: objects end {row.nearer.value:.1f} cm nearer '
                 'to their goals via the predicted subgoal.')

@@ -94,12 +94,15 @@ class ExplorerCalls:
     :param node: rclpy Node that another thread spins.
     :param display: that shows what happens.
     :param on_error: called with what went wrong for which nobody but us is to blame.
+    :param on_selected: called when other objects are followed.
     :ivar end: how the last goal of a browser ended, in words; whether it was reached, or stopped
         because its steps were spent.
     """
 
-    def __init__(self, node: Node, display: Display, on_error: Callable[[str], object]) -> None:
-        self._node, self._display, self._on_error = node, display, on_error
+    def __init__(self, node: Node, display: Display, on_error: Callable[[str], object],
+                 on_selected: Callable[[], object]) -> None:
+        self._node, self._display = node, display
+        self._on_error, self._on_selected = on_error, on_selected
         self._by_hand = GoalByHand(node)
         self._client = Client(node=node, timeout_s=TIMEOUT_S)
         self._lock = threading.Lock()
@@ -212,6 +215,7 @@ class ExplorerCalls:
         response = self._call('select', names=[one['name'] for one in objects],
                               u=[float(one['u']) for one in objects],
                               v=[float(one['v']) for one in objects])
+        self._on_selected()
         self._display.select(response, followed=True)
         self._display.events.add(escaped(response.message, 1000),
                                  problem=len(response.objects) < len(objects))

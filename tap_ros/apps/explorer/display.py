@@ -94,7 +94,7 @@ class Display:
             names = [] if message is None else list(compress(
                 message.object_names, decode_subgoal(message, message.object_names).undecided))
         except TapError:
-            return ''  # its picture is not shown, either
+            return ''
         if names:
             return f'undecided about {listing(names)}'
         return 'the subgoal is there'

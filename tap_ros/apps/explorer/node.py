@@ -59,13 +59,15 @@ class ExplorerNode(Node):
         self._task = self.params['task']
         self._seed: int | None = None  # of the scene, once it is told
         self._scenes = 0  # that have begun
-        # The newest subgoal, in words; whether the arm has moved since.
+        self._begun_ns = time.time_ns()
+        # The newest subgoal, in words; whether the arm has moved since, or may have.
         self._subgoal, self._passed = '', False
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
         kind, topic = camera_image(self.params)
         self._diagnostics = Diagnostics(
             self, [topic, 'objects'], ['goal/image', 'goal/objects'])
-        self._calls = ExplorerCalls(self, self._display, self._diagnostics.error)
+        self._calls = ExplorerCalls(
+            self, self._display, self._diagnostics.error, self._forget_predictions)
         self._server = ExplorerServer(
             self._calls.do, self.params['host'], self.params['port'], self.params['token'])
         adapt_regularly(self, [
@@ -117,7 +119,7 @@ class ExplorerNode(Node):
                 if name == 'objects' and before and _names(before) != _names(message):
                     self._forget('subgoal', 'plan')  # they are of other objects
                 if name == 'subgoal':
-                    self._passed = False
+                    self._passed = info.get('source_timestamp', 0) < self._begun_ns
                 if name == 'goal_objects' and before and _places(before) != _places(message):
                     self._calls.forget_end()  # of a goal that somebody has moved since
                 newest[name] = message, reception_time(info)
@@ -130,6 +132,11 @@ class ExplorerNode(Node):
             self._display.newest.pop(kind, None)
             self._changed.discard(kind)
             self._server.put(kind, b'')
+
+    def _forget_predictions(self) -> None:
+        """Show what was predicted no more: it is of other objects."""
+        with self._display.lock:
+            self._forget('subgoal', 'plan')
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:
@@ -181,7 +188,9 @@ class ExplorerNode(Node):
             newest, changed, self._changed = dict(shown.newest), self._changed, set()
         for kind in changed & {*PICTURES}:
             image = shown.picture(kind)
-            if image is not None:
+            if image is None:
+                self._server.put(kind, b'')
+            else:
                 shown.sizes[kind] = image.shape[1], image.shape[0]
                 self._server.put(kind, picture_bytes(image, kind == 'plan'))
         if 'subgoal' in changed:
@@ -203,8 +212,7 @@ class ExplorerNode(Node):
                        'targets': display.listed({n: goals[n] for n in objects if n in goals}),
                        'note': display.silence(now, newest.get('camera')),
                        'objects_note': display.silence(now, newest.get('objects'))},
-            'subgoal': ('of an earlier picture' if self._passed and not running
-                        else self._subgoal),
+            'subgoal': self._subgoal, 'passed': self._passed and not running,
             'goal': {**shown.size('goal'),
                      'objects': display.listed(goals, newest.get('goal_objects', [None])[0]),
                      'pictured': 'goal' in newest},

@@ -229,8 +229,8 @@ def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],
         subgoal.warning: None for subgoal in subgoals if subgoal.warning})
     undecided = np.any([subgoal.undecided for subgoal in subgoals], 0)
     if undecided.any():
-        message += (f'; undecided about {listing(compress(task.names, undecided))}: expected in '
-                    'more than one place')
+        message += (f'; undecided about {listing(compress(task.names, undecided))}: no single '
+                    'place is expected')
     return PredictSubgoal.Response(
         success=True, message=message, model_time_ms=elapsed_ms,
         subgoals=[encode_subgoal(

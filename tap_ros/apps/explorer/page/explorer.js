@@ -89,7 +89,7 @@ function progress() {
   const camera_why = !camera.width ? 'waits for the camera' : camera.note && `the camera ${camera.note}`;
   const goal_why = goal.pictured ? '' : 'needs a goal picture: step 3';
   const place_why = missing.length ? `needs the goal of ${missing.join(', ')}: step 3` : '';
-  const predict_why = camera_why || goal_why || (tracker && !count && 'needs objects: step 2') || place_why || (!state.predictor && 'needs the predictor, which does not run');
+  const predict_why = camera_why || goal_why || place_why || (!state.predictor && 'needs the predictor, which does not run');
   const go_why = !state.plans ? `nothing plans how to grasp: for ${state.task} subgoals are predicted only`
     : camera_why || (!count && 'needs objects: step 2') || place_why
     || (!state.planner && 'needs the planner, which does not run');
@@ -100,12 +100,12 @@ function progress() {
     scene: [!camera_why && known, camera_why || (!known ? '' : !simulator ? `${camera.width}x${camera.height} pixels`
       : state.seed === null ? state.task : `${state.task}, seed ${state.seed}`), camera_why],
     objects: [count > 0 && !anew, selecting() ? clicked : !count ? untracked() ? 'waits for objects: start tracker_node' : 'waits for objects'
-      : camera.objects_note ? `their tracker ${camera.objects_note}` : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} known`, camera_why],
+      : camera.objects_note ? `${tracker ? 'the tracker' : 'what tells their places'} ${camera.objects_note}` : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
       ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
       : count && missing.length ? `drag to ${missing.length > 1 ? 'their goals' : 'its goal'}: ${missing.join(', ')}` : goal.pictured ? 'the picture is there' : 'placed by hand',
     camera_why],
-    predict: [Boolean(pictures.subgoal), pictures.subgoal ? state.subgoal : predict_why || 'can be predicted now', predict_why],
+    predict: [pictures.subgoal && !state.passed, pictures.subgoal ? state.passed ? 'of an earlier picture' : state.subgoal : predict_why || 'can be predicted now', predict_why],
     go: [run.reached, run.running ? run.stage : run.end || go_why || 'the arm can go now', go_why]};
 }
 
@@ -114,7 +114,7 @@ function showState() {
   if (on && run.running) showRun(run.stage.split(', plan')[0] || 'starting', 'busy');
   else if (on) showRun(done.scene[2] || (state.planner ? 'the arm stands still' : 'no planner runs'), done.scene[2] || !state.planner ? '' : 'good');
   document.body.classList.toggle('running', on && run.running);
-  lead(run.running || run.reached ? 'go' : STEPS.find((one) => !done[one][0] && done[one][1]) ?? 'go', run.running || run.end);
+  lead(run.running || run.end ? 'go' : STEPS.find((one) => !done[one][0] && done[one][1]) ?? 'go', run.running || run.end);
   for (const one of STEPS) {
     const item = $(`step-${one}`);
     item.classList.toggle('done', Boolean(done[one][0]));
@@ -150,8 +150,8 @@ function showState() {
   listObjects();
   const [wrong, waits] = ['wrong', 'waits'].map((how) => state.nodes.filter((one) => one.state === how).length);
   $('nodes').className = wrong ? 'wrong' : '';
-  $('nodes').querySelector('span').textContent = !on ? 'not known' : wrong ? `${wrong} of ${state.nodes.length} with a problem`
-    : waits ? `all ready, ${waits} of ${state.nodes.length} wait` : 'all work';
+  $('nodes').querySelector('span').textContent = !on || !state.nodes.length ? 'none known' : wrong ? `${wrong} of ${state.nodes.length} with a problem`
+    : waits ? `${waits} of ${state.nodes.length} waiting` : 'all work';
   fill($('nodes').querySelector('tbody'), state.nodes, (one) => made('tr', {className: one.state},
     made('td', {textContent: one.name}), made('td', {textContent: one.text})));
   $('large').className = view === 'camera' && selecting() ? 'click' : movable() ? 'drag' : '';
@@ -189,7 +189,7 @@ function hint() {
   const searched = missing.every((name) => state.goal.objects.some((one) => one.name === name));
   return {
     camera: untracked() ? 'Start tracker_node to click on objects here.' : `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
-    goal: moves && missing.length ? (searched ? 'Not found in this picture' : 'Looking here for') + `: ${missing.join(', ')}. ${searched ? 'Drag each to its place here.' : ''}`
+    goal: moves && missing.length ? `${searched ? 'Not found in this picture' : 'No goal known yet for'}: ${missing.join(', ')}. Drag each to its place here.`
       : `What the table is to look like.${moves ? ' Drag an object to change that.' : ''}`,
     subgoal: 'The predicted picture in between' + (state.camera.objects.length ? ': each object glows where it is expected then.' : '.'),
     plan: 'Paths of the fingertips that the planner considered; bold: the chosen one.',

@@ -12,8 +12,8 @@ const VIEWS = {  // kind: [name, what will be there]
   camera: ['now', 'What the camera sees will be here, once it sends a picture.'],
   goal: ['goal', 'The goal picture will be here: what the table is to look like.'],
   subgoal: ['subgoal', 'The predicted subgoal will be here, after step 4: the picture in '
-    + 'between, in which each object glows where it is expected.'],
-  plan: ['plan', 'The newest plan will be here, once the arm moves: the ways that were '
+    + 'between, in which objects of step 2 glow where they are expected.'],
+  plan: ['plan', 'The newest plan will be here, once the arm moves: the paths that were '
     + 'considered, and the one that was chosen.'],
   observer: ['arm', 'The whole arm will be here, as the camera would see it.']};
 
