@@ -147,7 +147,7 @@ def _stills(scene: Scene) -> Iterator[tuple[str, str]]:
         yield f'predicted: {scene.decided(subgoal)}', _still(scene.headed(i))
     for mode, name in MODES.items():
         run = runs[mode]
-        yield (f'{name}: {run.final_cm:.1f} cm, {"reached" if run.reached else "failed"}',
+        yield (f'{name}: {run.final_cm:.1f} cm, {"success" if run.reached else "failed"}',
                _still(scene.seen(mode, -1)))
 
 
