@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 from tap_ros.base.contract import MAP_ENCODING
 from tap_ros.base.errors import PlanningError
@@ -16,7 +15,7 @@ from tap_ros.messages.images import decode_image, decode_map, image_fields, map_
 from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import header_fields, Stamp
 
-NEAR = 1 / 16  # of the width: the radius of one place
+NEAR = 1 / 16  # of the width: half a side of the square that is one place
 ELSEWHERE = 0.25  # of a map: what is decided has less outside of its likeliest place
 
 
@@ -51,11 +50,12 @@ class Subgoal:
     @property
     def undecided(self) -> np.ndarray:
         """Whether the map of each object is spread out or has several places, bool (K,)."""
-        radius = max(1, round(NEAR * self.object_maps.shape[2]))
-        y, x = np.mgrid[-radius:radius + 1, -radius:radius + 1]
-        place = (np.hypot(x, y) <= radius).astype(np.float32)
-        return np.array([cv2.filter2D(one, -1, place, borderType=cv2.BORDER_CONSTANT).max()
-                         < 1 - ELSEWHERE for one in self.object_maps], bool)
+        half = max(1, round(NEAR * self.object_maps.shape[2]))
+        side, beside = 2 * half + 1, (half + 1, half)
+        sums = np.pad(self.object_maps, ((0, 0), beside, beside)).cumsum(1).cumsum(2)
+        rows = sums[:, side:] - sums[:, :-side]
+        squares = rows[..., side:] - rows[..., :-side]  # what is around each pixel
+        return np.asarray(squares.max((1, 2)) < 1 - ELSEWHERE)
 
 
 def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int, frame_id: str,
