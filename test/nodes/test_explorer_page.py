@@ -9,10 +9,19 @@ from processes import Client, LocalNode, until
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates
+from tap_msgs.msg import Subgoal as SubgoalMessage
 from tap_msgs.srv import ResetScene, SelectObjects
 from tap_ros.apps.explorer.node import ExplorerNode
 from tap_ros.base.contract import CAMERA_FRAME
-from tap_ros.ros.topics import encode_image, encode_objects, STREAM, to_stamp
+from tap_ros.messages.subgoals import Subgoal
+from tap_ros.ros.topics import (
+    encode_image,
+    encode_objects,
+    encode_subgoal,
+    LATCHED,
+    STREAM,
+    to_stamp,
+)
 from visualization_msgs.msg import ImageMarker
 
 pytestmark = [pytest.mark.slow, needs_browser]
@@ -183,6 +192,31 @@ def test_outlines_turn_with_objects_and_a_goal_that_is_moved_is_not_gone_on_to(e
         page.evaluate("showRun('step 3 of at most 80, to the subgoal', 'busy')")
         assert page.evaluate("$('run').scrollWidth <= $('run').clientWidth")
         assert not hidden_or_over(page, '#run', '#cancel', '#stage')
+
+
+def test_a_subgoal_says_what_it_is_undecided_about_and_goes_when_others_are_followed(
+        explorer, browser):
+    maps = np.zeros((1, 64, 64), np.float32)
+    maps[0, 10, 10] = maps[0, 50, 50] = 0.5
+    predicted = Subgoal(np.full((HIGH, WIDE, 3), 60, np.uint8), maps,
+                        np.float32([[30, 30]]), np.ones(1, np.float32), 0, 1)
+    with opened(browser, explorer.node.url) as page, Client('camera') as node:
+        Camera(node)
+        publisher = node.create_publisher(SubgoalMessage, 'subgoal', LATCHED)
+        page.wait_for_function('pictures.camera && state.tracker && state.camera.width')
+        for again in (False, True):
+            if again:
+                page.click('#again')
+            page.mouse.click(*at(page, *CUP))
+            page.click('#follow')
+            page.wait_for_function('!selecting() && state.camera.objects.length')
+            page.wait_for_function('!pictures.subgoal')
+            if not again:
+                publisher.publish(encode_subgoal(
+                    predicted, ['object_0'], to_stamp(2 * 10**9), CAMERA_FRAME))
+                page.wait_for_function('pictures.subgoal && state.subgoal')
+                assert says(page, 'predict') == 'undecided about object_0'
+                page.evaluate("look('camera')")
 
 
 def test_beside_a_camera_alone_the_page_says_what_to_start(explorer, browser):

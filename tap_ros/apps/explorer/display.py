@@ -88,16 +88,16 @@ class Display:
             return {}
 
     def subgoal(self) -> str:
-        """Say what the newest subgoal tells, '' without one."""
+        """Say what the newest subgoal tells, '' without one that can be used."""
         message, _ = self.newest.get('subgoal', (None, 0.0))
+        if message is None:
+            return ''
         try:
-            names = [] if message is None else list(compress(
-                message.object_names, decode_subgoal(message, message.object_names).undecided))
+            undecided = decode_subgoal(message, message.object_names).undecided
         except TapError:
             return ''
-        if names:
-            return f'undecided about {listing(names)}'
-        return 'the subgoal is there'
+        names = listing(compress(message.object_names, undecided))
+        return f'undecided about {names}' if names else 'the subgoal is there'
 
     def size(self, kind: str) -> dict[str, int]:
         """Return width and height of the newest picture of a kind; 0 without one."""

@@ -119,7 +119,7 @@ class ExplorerNode(Node):
                 if name == 'objects' and before and _names(before) != _names(message):
                     self._forget('subgoal', 'plan')  # they are of other objects
                 if name == 'subgoal':
-                    self._passed = info.get('source_timestamp', 0) < self._begun_ns
+                    self._passed = 0 < info.get('source_timestamp', 0) < self._begun_ns
                 if name == 'goal_objects' and before and _places(before) != _places(message):
                     self._calls.forget_end()  # of a goal that somebody has moved since
                 newest[name] = message, reception_time(info)
