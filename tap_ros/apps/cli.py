@@ -122,11 +122,15 @@ def read(line: CommandLine, arguments: Sequence[str]) -> tuple[Callable[[Any], A
 
 
 def _check(commands: Commands, words: Sequence[str]) -> None:
-    """Exit with code 2 where a word is no command; say which is nearest, and all that are."""
+    """Exit with code 2 where a word is no command or missing; say which is nearest, and all."""
     word = words[0].replace('_', '-') if words else '-'
     if word in commands:
         inner = commands[word][1]
         if not callable(inner):
+            if not words[1:]:
+                print(f'error: {word} needs a second word; valid: {", ".join(inner)}',
+                      file=sys.stderr)
+                raise SystemExit(2)
             _check(inner, words[1:])
     elif not word.startswith('-'):
         print(f'error: command {escaped(words[0], 60)!r} is unknown; {meant(word, commands)}'

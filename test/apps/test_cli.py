@@ -49,6 +49,14 @@ def test_an_unknown_command_is_answered_with_the_nearest_one(words, near, others
     assert said.count('\n') == 1
 
 
+def test_a_command_without_its_second_word_is_told_the_choices(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(['evaluate'])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == (
+        'error: evaluate needs a second word; valid: prediction, forward\n')
+
+
 def test_a_progress_bar_in_a_pipe_is_one_line(tmp_path):
     words = ['collect', '--out', 'bag', '--episodes', '3', '--task', 'grasp',
              '--episodes-per-file', '1']

@@ -71,7 +71,7 @@ function draw() {
   $('busy').textContent = state.busy ? 'finding labels …' : '';
   $('play').textContent = playing ? 'Stop' : 'Play';
   const listed = draft.map((t, k) => t === null ? `${nameOf(k)} not yet` : `${nameOf(k)} ${second(t)}`);
-  const guess = labels().map(([t, sure], k) => `${names()[k] || ''} ${second(t)} (${Math.round(100 * sure)}%)`);
+  const guess = labels().map(([t, sure], k) => `${names()[k] || ''} ${second(t)} (confidence ${Math.round(100 * sure)}%)`);
   $('title').textContent = `Demonstration ${episode} (0 to ${state.lengths.length - 1}): ` +
     (given().length ? listed.join(', ') + (isSaved() ? '' : ' (not saved)') : 'nothing marked') + (guess.length ? `; label: ${guess.join(', ')}` : '');
   $('file').textContent = `saved ${names().length > 1 ? 'once each name is marked' : 'at once'}, in ${state.file}`;

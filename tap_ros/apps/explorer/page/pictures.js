@@ -8,14 +8,14 @@ const COLOURS = ['#ffb000', '#648fff', '#dc267f', '#009e73'];  // as in tap_ros/
 const STATE_COLOURS = {seen: '#2fbf5b', hidden: '#9aa6b8', unsure: '#ff9f1c', lost: '#e5484d'};
 const SHARP = 1024;  // least width (px) to which a picture is drawn, each pixel a square
 const SMALL = 96;  // px, of the switches
-const VIEWS = {  // kind: [name, what will be there]
-  camera: ['now', 'What the camera sees will be here, once it sends a picture.'],
-  goal: ['goal', 'The goal picture will be here: what the table is to look like.'],
-  subgoal: ['subgoal', 'The predicted subgoal will be here, after step 4: the picture in '
+const VIEWS = {  // kind: [name, what is said without a picture: small, large]
+  camera: ['now', 'no picture', 'What the camera sees will be here, once it sends a picture.'],
+  goal: ['goal', 'step 3', 'The goal picture will be here: what the table is to look like.'],
+  subgoal: ['subgoal', 'step 4', 'The predicted subgoal will be here, after step 4: the picture in '
     + 'between, in which objects of step 2 glow where they are expected.'],
-  plan: ['plan', 'The newest plan will be here, once the arm moves: the paths that were '
+  plan: ['plan', 'step 5', 'The newest plan will be here, once the arm moves: the paths that were '
     + 'considered, and the one that was chosen.'],
-  observer: ['arm', 'The whole arm will be here, as the camera would see it.']};
+  observer: ['arm', 'no picture', 'The whole arm will be here, as the camera would see it.']};
 
 let state = null;
 const pictures = {};  // kind -> ImageBitmap
@@ -37,6 +37,7 @@ async function takePicture(bytes) {
   if (pictures[kind]) pictures[kind].close();
   pictures[kind] = bitmap;
   const small = $(`small-${kind}`), context = small.getContext('2d');
+  small.hidden = !bitmap;
   context.reset();
   if (bitmap) {
     small.height = Math.round(SMALL * bitmap.height / bitmap.width);
@@ -53,17 +54,17 @@ function look(kind) {
   if (state) showState();
 }
 
-for (const [kind, [name]] of Object.entries(VIEWS)) {
+for (const [kind, [name, why]] of Object.entries(VIEWS)) {
   $('views').append(made('label', {},
     made('input', {type: 'radio', name: 'view', id: `view-${kind}`, checked: kind === view, onchange: () => look(kind)}),
-    made('canvas', {id: `small-${kind}`, width: SMALL, height: SMALL}), name));
+    made('canvas', {id: `small-${kind}`, width: SMALL, height: SMALL, hidden: true}), made('small', {ariaHidden: 'true'}, why), name));
 }
 
 // Drawing, in pixels of the camera's picture, (0, 0) the centre of the first one
 
 function draw() {
   const context = paint();
-  $('empty').textContent = context ? '' : VIEWS[view][1];
+  $('empty').textContent = context ? '' : VIEWS[view][2];
   if (!context || !state) return;
   if (view === 'camera' && selecting()) {
     clicks.forEach((one, k) => drawOutlined(context, one, COLOURS[k % 4], one.outline));
