@@ -125,7 +125,7 @@ def resize_image(image: np.ndarray, size: Sequence[int]) -> np.ndarray:
     :return: uint8 (height, width, 3).
     """
     import torch  # as above
-    planes = torch.from_numpy(np.moveaxis(image, -1, 0).astype(np.float32, order='C'))[None]
+    planes = torch.from_numpy(image.astype(np.float32, order='C')).movedim(-1, 0)[None]
     planes = torch.nn.functional.interpolate(
         planes, tuple(size), mode='bilinear', antialias=True, align_corners=False)
     return planes[0].round().clamp(0, 255).byte().movedim(0, -1).contiguous().numpy()

@@ -30,6 +30,7 @@ MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
 MOST_UNSURE = 10  # pictures in a row in which an object is not known for sure; likewise
 MOST_LATE = 3  # plans in a row that took too long to be acted upon; likewise
 SENDING = 0.1  # share of max_age that is left for sending a command
+MOVED = 0.5  # share of a move from which on a picture shows its effect
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,7 @@ class Reach:
         self._planned: Command | None = None
         self._answered: Command | None = None
         self._after_ns = -1  # pictures count that are stamped later than this
+        self._surely_ns = -1  # and those that show no move yet, later than this
         # After the last command; before it, with what was answered and sent then; after the next.
         self._state: _State | None = None
         self._before: tuple[_State, Command | None, float] | None = None
@@ -209,6 +211,8 @@ class Reach:
                         and self._refusal else missing or 'no new picture since the last command')
         if seen.stamp_ns < seen.scene_ns:
             return Wait('the picture is of an old scene')
+        if seen.stamp_ns <= self._surely_ns and not self._has_moved(seen):
+            return Wait(missing or 'the gripper has not moved since the last command')
         age = now - seen.received
         if age > self._config.max_age:
             return Wait(f'what was seen is {age:.1f} s old' + (f': {missing}' if missing else ''))
@@ -218,6 +222,14 @@ class Reach:
         if self._state is None:
             return Wait('an object is unsure') if UNSURE in seen.states else SelectTargets(seen)
         return self._plan(seen, self._state, (1 - SENDING) * self._config.max_age - age)
+
+    def _has_moved(self, seen: Observation) -> bool:
+        """Return whether the gripper has gone most of what the last command told it to."""
+        if self._answered is None:
+            return True
+        moved = seen.gripper[:3] - self._answered.seen.gripper[:3]
+        told = self._answered.plan.action[:3]
+        return bool(np.linalg.norm(moved) >= MOVED * np.linalg.norm(told))
 
     def interrupted(self, seen: Observation | None) -> End | None:
         """
@@ -267,13 +279,15 @@ class Reach:
         self._state = self._next = state
         self._sent_at = now
 
-    def sent(self, after_ns: int | None = None, now: float = 0.0) -> None:
+    def sent(self, after_ns: int | None = None, now: float = 0.0, late_ns: int = 0) -> None:
         """
         Say that the last Command is carried out.
 
         :param after_ns: pictures show its effect that are stamped later than this; None: than the
             picture that it answers.
         :param now: s.
+        :param late_ns: the arm may begin so much later; until then only pictures count in which
+            the gripper has moved.
         """
         command, self._planned = self._planned, None
         assert command is not None and self._state is not None, 'a Command comes first'
@@ -283,6 +297,7 @@ class Reach:
         self._sent_at = now
         self._state, self._answered = self._next, command
         self._after_ns = command.seen.stamp_ns if after_ns is None else after_ns
+        self._surely_ns = self._after_ns + late_ns
         self.steps += 1
 
     def refused(self, stamp_ns: int, reason: str) -> bool:
@@ -298,7 +313,8 @@ class Reach:
             return False
         (self._state, self._answered, self._sent_at), self._before = self._before, None
         self._next = self._state
-        self._after_ns, self._planned = refused.seen.stamp_ns, None
+        self._after_ns = self._surely_ns = refused.seen.stamp_ns
+        self._planned = None
         self.steps -= 1
         self._refusal, self._refused = reason, self._refused + 1
         return True

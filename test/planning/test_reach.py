@@ -115,6 +115,20 @@ def test_a_refused_command_does_not_count_and_the_newer_picture_is_answered(mpc)
     assert reach.steps == 2
 
 
+def test_a_picture_of_before_the_move_is_waited_past_but_not_for_ever(mpc):
+    reach = begun(mpc)
+    move = reach.step(look(0)).plan.action[:3]
+    assert np.linalg.norm(move) > 0
+    reach.sent(after_ns=2 * SECOND, late_ns=2 * SECOND)
+    still, there = look(0).gripper, look(0).gripper + np.append(0.9 * move, 0)
+    waiting = reach.step(look(2, gripper=still))
+    assert isinstance(waiting, Wait) and 'not moved' in waiting.reason
+    assert isinstance(reach.step(look(2, gripper=there)), Command)
+    assert isinstance(reach.step(look(4, gripper=still)), Command), 'the arm may be blocked'
+    assert reach.refused(SECOND, 'it came late')
+    assert isinstance(reach.step(look(2, gripper=still)), Command), 'no move is expected'
+
+
 def test_old_and_missing_sights_are_waited_for_and_then_end_the_goal(mpc):
     reach = begun(mpc)
     for seen in (None, look(1, received=-9.0)):

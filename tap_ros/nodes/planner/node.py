@@ -296,8 +296,9 @@ class VisualMpcNode(LifecycleBase):
             # Before sending: the picture that answers may come at once.
             newest_ns = self._inputs.newest_stamp()
             if isinstance(answer, Command) and self._send(handle, accepted, reach, answer):
-                reach.sent(newest_ns + int(0.9e9 * self.params['control_period']),
-                           time.monotonic())
+                period_ns = int(1e9 * self.params['control_period'])
+                reach.sent(newest_ns + 9 * period_ns // 10, time.monotonic(),
+                           period_ns if answer.seen.received < math.inf else 0)
                 result.steps = reach.steps
                 self._publish_progress(handle, reach, answer)
             else:
