@@ -30,7 +30,7 @@ MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
 MOST_UNSURE = 10  # pictures in a row in which an object is not known for sure; likewise
 MOST_LATE = 3  # plans in a row that took too long to be acted upon; likewise
 SENDING = 0.1  # share of max_age that is left for sending a command
-MOVED = 0.5  # share of a move from which on a picture shows its effect
+MOVED = 0.8  # share of a move from which on a picture shows its effect
 
 
 @dataclass(frozen=True)

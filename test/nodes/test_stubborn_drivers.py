@@ -8,6 +8,7 @@ import time
 from types import SimpleNamespace
 
 from driven import Arm, first_pictures, goal_fields, TOPICS, World
+import numpy as np
 from processes import Client, LocalNode, until
 import pytest
 from rclpy.parameter import Parameter
@@ -28,19 +29,21 @@ class Rig:
     A planner of this process, and a World and an Arm for it.
 
     :ivar threads: that have planned.
+    :ivar plan: what they answer; scenes: from which they did.
     """
 
     def __init__(self, node, world):
-        self.world, self.arm, self.threads = world, Arm(node), set()
+        self.world, self.arm, self.threads, self.scenes = world, Arm(node), set(), []
         self.client = tap_ros.Client(node=node)
         self.planner = LocalNode(VisualMpcNode, num_threads=4, max_age=30.0)
         mpc, (seen, goal) = self.planner.node._mpc, first_pictures()
-        plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels),
-                        mpc.goal(goal.object_pixels))
+        self.plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels),
+                             mpc.goal(goal.object_pixels))
 
-        def planned(*_):  # at once, so that a busy machine is fast enough
+        def planned(scene, *_):  # at once, so that a busy machine is fast enough
             self.threads.add(threading.get_ident())
-            return plan
+            self.scenes.append(scene)
+            return self.plan
 
         mpc.plan = planned
         self.client.wait_until_ready('visual_mpc_node')
@@ -87,6 +90,21 @@ def test_an_arm_that_refuses_everything_ends_the_goal_and_the_next_one_is_served
         result, moves = rig.reach(2)
         assert result.end == 'succeeded' and result.steps == moves == 2, result.message
     assert len(rig.threads) == 1, 'each one that has planned keeps memory of its own'
+
+
+def test_an_arm_that_begins_late_is_commanded_from_where_it_comes_to(rig):
+    there = first_pictures()[0].gripper + np.append(rig.plan.action[:3], 0)
+
+    def move(_):
+        time.sleep(1.4 * rig.planner.node.params['control_period'])
+        rig.world.gripper = there
+
+    rig.scenes.clear()
+    result, moves = rig.reach(2, lambda feedback: threading.Thread(
+        target=move, args=[feedback]).start() if feedback.step == 1 else None)
+    assert result.end == 'succeeded' and moves == 2, result.message
+    assert np.linalg.norm((rig.scenes[0].gripper - there)[:3]) > 0.02
+    np.testing.assert_allclose(rig.scenes[-1].gripper, there, atol=0.005)
 
 
 def test_drivers_that_repeat_one_stamp_move_nothing_unless_a_clock_stands_still(rig):

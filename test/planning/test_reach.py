@@ -120,7 +120,7 @@ def test_a_picture_of_before_the_move_is_waited_past_but_not_for_ever(mpc):
     move = reach.step(look(0)).plan.action[:3]
     assert np.linalg.norm(move) > 0
     reach.sent(after_ns=2 * SECOND, late_ns=2 * SECOND)
-    still, there = look(0).gripper, look(0).gripper + np.append(0.9 * move, 0)
+    still, there = (look(0).gripper + np.append(share * move, 0) for share in (0.6, 0.9))
     waiting = reach.step(look(2, gripper=still))
     assert isinstance(waiting, Wait) and 'not moved' in waiting.reason
     assert isinstance(reach.step(look(2, gripper=there)), Command)
