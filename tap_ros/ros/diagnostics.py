@@ -87,7 +87,8 @@ class Diagnostics:
             (streams, STALE_S), (others, math.inf)) for topic in topics}
         self._inputs = {topic: Record() for topic in self._max_age_s}
         self._expected = {node.resolve_topic_name(topic) for topic in expected}
-        self._told: set[str] = set()  # topics whose silence has been logged
+        self._silent: set[str] = set()  # topics on which nothing had come when last looked at
+        self._told: set[str] = set()  # those of them that have been logged
         self._shared: set[str] = set()  # topics of which it has been logged that several publish
         self._work: dict[str, Record] = {}
         self._errors, self._last_error, self._error_time = 0, '', -math.inf
@@ -138,6 +139,8 @@ class Diagnostics:
         for topic in sorted(cameras.keys() - self._shared):
             self._node.get_logger().warning(f'{escaped(cameras[topic])}; leave one of them')
         self._shared = {*cameras}
+        # What waited while this process was kept from running has been taken by the second look.
+        silent, self._silent = silent & self._silent, silent
         for topic in sorted(silent - self._told):
             why = why_silent(self._node, topic, types.get(topic))
             if not why and types.get(topic) is ObjectStates:

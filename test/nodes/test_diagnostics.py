@@ -132,7 +132,8 @@ def test_a_recorder_that_hears_nothing_says_so_and_does_not_succeed(
         assert node.end() == 0
 
 
-def test_a_node_is_not_told_of_silence_while_it_started(client, hurried, capfd):
+def test_a_node_is_not_told_of_silence_while_it_started_or_was_kept_from_listening(
+        client, hurried, capfd):
     pictures = client.create_publisher(Image, 'camera/image_raw', STREAM)
     client.create_timer(0.1, lambda: pictures.publish(Image()))
 
@@ -143,7 +144,12 @@ def test_a_node_is_not_told_of_silence_while_it_started(client, hurried, capfd):
 
     node = LocalNode(slowly, topics=['camera/image_raw'], record_on_start=False)
     try:
-        assert until(lambda: node.node._diagnostics._inputs['/camera/image_raw'].count > 10)
+        camera = node.node._diagnostics._inputs['/camera/image_raw']
+        assert until(lambda: camera.count > 10)
+        busy = node.node.create_timer(0.01, lambda: (busy.cancel(), time.sleep(3.0)))
+        assert until(busy.is_canceled)
+        before = camera.count
+        assert until(lambda: camera.count > before + 10)
     finally:
         assert node.end() == 0
     assert 'nothing has come' not in capfd.readouterr().err
