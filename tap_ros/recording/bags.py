@@ -37,7 +37,8 @@ def find_bags(paths: Paths) -> list[Bag]:
     """
     Find recordings.
 
-    :param paths: one or several .mcap files, bag folders, or folders of bag folders; a Bag stays.
+    :param paths: one or several .mcap files, bag folders, folders of bag folders, or of both; a
+        Bag stays.
     :return: list of Bag, in the order of the paths, those of a folder by the numbers in their
         names. No file is opened yet.
     :raises RecordingError: where there is none; it says what is there instead.
@@ -75,11 +76,9 @@ def _find(path: Path) -> list[list[Path]]:
             raise RecordingError(
                 f'{path}: there is no such file or folder' if not path.exists() else
                 f'{path}: neither a regular file nor a folder')
-        elif files := _files(path):
-            bags = [files]
         else:
-            bags = [files for part in sorted(path.iterdir(), key=natural) if part.is_dir()
-                    and (files := _files(part))]
+            parts = [part for part in sorted(path.iterdir(), key=natural) if part.is_dir()]
+            bags = [files for part in (path, *parts) if (files := _files(part))]
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     if not bags:

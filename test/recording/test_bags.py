@@ -10,6 +10,7 @@ import sys
 from made_bags import camera, IMAGE, JOINTS, mark, read, record, shown, write_mcap
 import pytest
 from tap_ros.base.errors import RecordingError, RecordingWarning
+from tap_ros.recording.bags import find_bags
 from tap_ros.recording.cache import open_recordings
 import yaml
 import zstandard
@@ -42,6 +43,14 @@ def test_a_recording_without_messages_says_so(tmp_path):
     only = write_mcap(tmp_path / 'b.mcap', [], [('/camera/image_raw', IMAGE)])
     with pytest.raises(RecordingError, match='b.mcap: holds no message'):
         open_recordings(only)
+
+
+def test_a_bag_that_holds_others_hides_none(tmp_path):
+    for folder in ('', 'b2', 'b10'):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        write_mcap(tmp_path / folder / 'a.mcap', [])
+    assert [bag.files[0].parent.name for bag in find_bags(tmp_path)] == [
+        tmp_path.name, 'b2', 'b10']
 
 
 KILLED = """
