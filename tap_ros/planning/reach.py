@@ -146,7 +146,8 @@ class Reach:
         self._planned: Command | None = None
         self._answered: Command | None = None
         self._after_ns = -1  # pictures count that are stamped later than this
-        self._surely_ns = -1  # and those that show no move yet, later than this
+        self._surely_ns = -1  # and those that do not show the last move yet, later than this
+        self._from = self._stood = np.zeros(4)  # gripper at its beginning; when last seen
         # After the last command; before it, with what was answered and sent then; after the next.
         self._state: _State | None = None
         self._before: tuple[_State, Command | None, float] | None = None
@@ -211,11 +212,11 @@ class Reach:
                         and self._refusal else missing or 'no new picture since the last command')
         if seen.stamp_ns < seen.scene_ns:
             return Wait('the picture is of an old scene')
-        if seen.stamp_ns <= self._surely_ns and not self._has_moved(seen):
-            return Wait(missing or 'the gripper has not moved since the last command')
         age = now - seen.received
         if age > self._config.max_age:
             return Wait(f'what was seen is {age:.1f} s old' + (f': {missing}' if missing else ''))
+        if now - self._sent_at < self._config.timeout / 2 and self._is_early(seen):
+            return Wait(missing or 'the last move is not seen yet')
         if self._planned is not None and self._planned.seen.stamp_ns == seen.stamp_ns:
             return self._planned
         self._first = self._first or seen
@@ -223,13 +224,12 @@ class Reach:
             return Wait('an object is unsure') if UNSURE in seen.states else SelectTargets(seen)
         return self._plan(seen, self._state, (1 - SENDING) * self._config.max_age - age)
 
-    def _has_moved(self, seen: Observation) -> bool:
-        """Return whether the gripper has gone most of what the last command told it to."""
-        if self._answered is None:
-            return True
-        moved = seen.gripper[:3] - self._answered.seen.gripper[:3]
+    def _is_early(self, seen: Observation) -> bool:
+        """Return whether a picture may be of before the end of the last move."""
+        if self._answered is None or seen.stamp_ns > self._surely_ns:
+            return False
         told = self._answered.plan.action[:3]
-        return bool(np.linalg.norm(moved) >= MOVED * np.linalg.norm(told))
+        return bool((seen.gripper - self._from)[:3] @ told < MOVED * (told @ told))
 
     def interrupted(self, seen: Observation | None) -> End | None:
         """
@@ -239,6 +239,7 @@ class Reach:
         """
         if seen is None:
             return None
+        self._stood = seen.gripper
         if self._first is not None and (change := scene_change(self._first, seen)):
             return End('aborted', f'the scene has changed: {change}')
         doubt = self._doubt(seen) if seen.stamp_ns >= seen.scene_ns else ''
@@ -250,7 +251,8 @@ class Reach:
             return f'{listing(lost)} lost; see where it is, and select the objects again'
         for name, state in zip(seen.names, seen.states):
             stamps = self._unsure.setdefault(name, set())
-            stamps.add(seen.stamp_ns)
+            if not self._is_early(seen):
+                stamps.add(seen.stamp_ns)
             if state != UNSURE:
                 stamps.clear()
             if len(stamps) >= MOST_UNSURE:
@@ -286,8 +288,8 @@ class Reach:
         :param after_ns: pictures show its effect that are stamped later than this; None: than the
             picture that it answers.
         :param now: s.
-        :param late_ns: the arm may begin so much later; until then only pictures count in which
-            the gripper has moved.
+        :param late_ns: the move may be seen so much later; until then only pictures count that
+            show most of it. It is never waited for longer than half the timeout.
         """
         command, self._planned = self._planned, None
         assert command is not None and self._state is not None, 'a Command comes first'
@@ -297,7 +299,7 @@ class Reach:
         self._sent_at = now
         self._state, self._answered = self._next, command
         self._after_ns = command.seen.stamp_ns if after_ns is None else after_ns
-        self._surely_ns = self._after_ns + late_ns
+        self._surely_ns, self._from = self._after_ns + late_ns, self._stood
         self.steps += 1
 
     def refused(self, stamp_ns: int, reason: str) -> bool:

@@ -105,7 +105,7 @@ def _read(source: np.ndarray, flow: np.ndarray, size: tuple[int, int]) -> np.nda
     """
     (H, W), (_, h, w), (height, width) = source.shape[:2], flow.shape, size
     u, v = (_wide(one, size) for one in flow)
-    u *= W / w  # in place: what is new has to be mapped first
+    u *= W / w  # in place, as new arrays cost page faults
     v *= H / h
     u += (np.arange(width, dtype=np.float32) + 0.5) * (W / width) - 0.5
     v += ((np.arange(height, dtype=np.float32) + 0.5) * (H / height) - 0.5)[:, None]

@@ -37,8 +37,8 @@ def find_bags(paths: Paths) -> list[Bag]:
     """
     Find recordings.
 
-    :param paths: one or several .mcap files, bag folders, folders of bag folders, or of both; a
-        Bag stays.
+    :param paths: one or several .mcap files, bag folders, or folders of bag folders; a Bag
+        stays.
     :return: list of Bag, in the order of the paths, those of a folder by the numbers in their
         names. No file is opened yet.
     :raises RecordingError: where there is none; it says what is there instead.
@@ -76,9 +76,12 @@ def _find(path: Path) -> list[list[Path]]:
             raise RecordingError(
                 f'{path}: there is no such file or folder' if not path.exists() else
                 f'{path}: neither a regular file nor a folder')
+        elif files := _files(path):
+            bags = [files]
+            _warn_of_more(path)
         else:
-            parts = [part for part in sorted(path.iterdir(), key=natural) if part.is_dir()]
-            bags = [files for part in (path, *parts) if (files := _files(part))]
+            bags = [files for part in sorted(path.iterdir(), key=natural) if part.is_dir()
+                    and (files := _files(part))]
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     if not bags:
@@ -89,6 +92,16 @@ def _find(path: Path) -> list[list[Path]]:
         if why := what_else(file):
             raise RecordingError(f'{file}: {why}')
     return bags
+
+
+def _warn_of_more(path: Path) -> None:
+    """Warn of recordings in folders of a bag."""
+    more = [part.name for part in sorted(path.iterdir(), key=natural)
+            if part.is_dir() and any(part.glob('*.mcap'))]
+    if more:
+        warnings.warn(RecordingWarning(
+            f'{escaped(path)}: is a recording itself; those in {listing(more, 5)} in it are left '
+            'out, name them'), stacklevel=2)
 
 
 def _files(folder: Path) -> list[Path]:

@@ -139,7 +139,7 @@ class Diagnostics:
         for topic in sorted(cameras.keys() - self._shared):
             self._node.get_logger().warning(f'{escaped(cameras[topic])}; leave one of them')
         self._shared = {*cameras}
-        # What waited while this process was kept from running has been taken by the second look.
+        # Twice: what waited while a busy machine kept this node from listening is taken by then.
         silent, self._silent = silent & self._silent, silent
         for topic in sorted(silent - self._told):
             why = why_silent(self._node, topic, types.get(topic))

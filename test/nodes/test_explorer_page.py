@@ -139,7 +139,7 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
             assert np.abs(clicked - (CUP, RING)).max() < 1, 'pixels of the camera'
             page.wait_for_selector('#step-goal[aria-current=step]')
             assert says(page, 'objects') == '2 objects known' and not page.inner_text('#error')
-            assert 'ring: hidden, 90 %' in page.inner_text('#clicks')
+            assert 'ring: hidden, 90%' in page.inner_text('#clicks')
             assert not hidden_or_over(page, '#stage', '#said', '#views', '#photograph', '#cancel')
             page.click('#photograph')
             page.wait_for_function('pictures.goal && state.goal.pictured')

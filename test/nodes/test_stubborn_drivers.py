@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Float64
 import tap_ros
 from tap_ros.nodes.planner.node import VisualMpcNode
-from tap_ros.planning.reach import MOST_REFUSED
+from tap_ros.planning.reach import MOST_REFUSED, Reach
 from tap_ros.planning.visual_mpc import Scene
 from tap_ros.robots.ur10e import UR10E
 from tap_ros.ros.topics import LATCHED
@@ -92,19 +92,33 @@ def test_an_arm_that_refuses_everything_ends_the_goal_and_the_next_one_is_served
     assert len(rig.threads) == 1, 'each one that has planned keeps memory of its own'
 
 
-def test_an_arm_that_begins_late_is_commanded_from_where_it_comes_to(rig):
+def test_an_arm_that_begins_late_is_commanded_from_where_it_comes_to(rig, monkeypatch):
     there = first_pictures()[0].gripper + np.append(rig.plan.action[:3], 0)
+    period_ns, begins, messages = int(0.25e9), [], rig.world.messages
+    sent = Reach.sent
+    monkeypatch.setattr(Reach, 'sent', lambda self, after_ns, *rest: (
+        begins.append(after_ns + period_ns // 2), sent(self, after_ns, *rest)))
 
-    def move(_):
-        time.sleep(1.4 * rig.planner.node.params['control_period'])
-        rig.world.gripper = there
+    def late(now_ns):
+        if begins and now_ns > begins[0]:
+            rig.world.gripper = there
+        return messages(now_ns)
 
+    monkeypatch.setattr(rig.world, 'messages', late)
     rig.scenes.clear()
-    result, moves = rig.reach(2, lambda feedback: threading.Thread(
-        target=move, args=[feedback]).start() if feedback.step == 1 else None)
+    result, moves = rig.reach(2)
     assert result.end == 'succeeded' and moves == 2, result.message
     assert np.linalg.norm((rig.scenes[0].gripper - there)[:3]) > 0.02
     np.testing.assert_allclose(rig.scenes[-1].gripper, there, atol=0.005)
+
+
+def test_refused_commands_that_are_stamped_with_now_do_not_count(rig):
+    rig.planner.node.set_parameters([Parameter('stamp_with_now', value=True)])
+    rig.arm.refusing = True
+    result, moves = rig.reach(3)
+    rig.planner.node.set_parameters([Parameter('stamp_with_now', value=False)])
+    assert result.end == 'aborted' and result.steps == 0 and moves == MOST_REFUSED
+    assert 'protective stop' in result.message
 
 
 def test_drivers_that_repeat_one_stamp_move_nothing_unless_a_clock_stands_still(rig):

@@ -15,6 +15,7 @@ from tap_ros.planning.reach import (
     End,
     MOST_LATE,
     MOST_REFUSED,
+    MOST_UNSURE,
     Observation,
     Reach,
     ReachConfig,
@@ -120,13 +121,30 @@ def test_a_picture_of_before_the_move_is_waited_past_but_not_for_ever(mpc):
     move = reach.step(look(0)).plan.action[:3]
     assert np.linalg.norm(move) > 0
     reach.sent(after_ns=2 * SECOND, late_ns=2 * SECOND)
-    still, there = (look(0).gripper + np.append(share * move, 0) for share in (0.6, 0.9))
-    waiting = reach.step(look(2, gripper=still))
-    assert isinstance(waiting, Wait) and 'not moved' in waiting.reason
-    assert isinstance(reach.step(look(2, gripper=there)), Command)
-    assert isinstance(reach.step(look(4, gripper=still)), Command), 'the arm may be blocked'
+
+    def gripper(share):
+        return look(0).gripper + np.append(share * move, 0)
+
+    for share in (0.6, -2.0):
+        waiting = reach.step(look(2, gripper=gripper(share)))
+        assert isinstance(waiting, Wait) and 'not seen yet' in waiting.reason
+    assert isinstance(reach.step(look(2, gripper=gripper(0.9))), Command)
+    assert isinstance(reach.step(look(3, gripper=gripper(0))), Wait), 'stamped at the limit'
+    assert isinstance(reach.step(look(4, gripper=gripper(0))), Command), 'the arm may be blocked'
+    assert isinstance(reach.step(look(2, gripper=gripper(0)), now=3.0), Command), 'time runs out'
     assert reach.refused(SECOND, 'it came late')
-    assert isinstance(reach.step(look(2, gripper=still)), Command), 'no move is expected'
+    assert isinstance(reach.step(look(2, gripper=gripper(0))), Command), 'no move is expected'
+    reach.sent(after_ns=2 * SECOND)  # as in lock-step
+    assert isinstance(reach.step(look(2, gripper=gripper(0))), Command)
+
+
+def test_pictures_of_before_the_move_do_not_count_as_unsure(mpc):
+    reach = begun(mpc)
+    act(reach, 0)
+    reach.step(look(1))
+    reach.sent(after_ns=2 * SECOND, late_ns=40 * SECOND)
+    for t in range(2, 2 + 2 * MOST_UNSURE):
+        assert isinstance(reach.step(look(t, states=('seen', 'unsure'))), Wait)
 
 
 def test_old_and_missing_sights_are_waited_for_and_then_end_the_goal(mpc):

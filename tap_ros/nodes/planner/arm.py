@@ -16,6 +16,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 from tap_ros.base.errors import PlanningError
 from tap_ros.base.text import escaped
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import CONTROL_PERIOD
 from tap_ros.nodes.planner.settings import check_period, step_limits
 from tap_ros.ros.observations import Observations
@@ -44,6 +45,7 @@ class ArmCommander:
         self._goal: object = None
         self._topics: tuple[str, ...] = ()
         self._moved_at = self._stopped_at = -math.inf  # monotonic time
+        self._stamps = 0, 0  # ns, of the last command and of the image that it answers
         self._ticked_at, self._stood_s = now_awake(), 0.0
         self._gripper = node.create_publisher(Float64, 'gripper/command', STREAM)
         self._twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
@@ -124,9 +126,15 @@ class ArmCommander:
             if self._closed or self._goal is not goal or self._silent(topics, now):
                 return False
             self._topics, self._moved_at = tuple(topics), now
+            self._stamps = to_nanoseconds(message.header.stamp), to_nanoseconds(stamp)
             self._gripper.publish(Float64(data=float(np.clip(action[3], 0, 1))))
             self._twist.publish(message)
         return True
+
+    def answered(self, stamp_ns: int) -> int:
+        """Return the stamp of the image that the last command answers; of another, its own."""
+        sent_ns, image_ns = self._stamps
+        return image_ns if stamp_ns == sent_ns else stamp_ns
 
     def close(self, seconds: float) -> None:
         """Stop the arm for good; wait until the command was delivered, at most so many seconds."""

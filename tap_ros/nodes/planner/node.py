@@ -271,7 +271,8 @@ class VisualMpcNode(LifecycleBase):
             self._go_on(handle)
             count = self._sensors.count
             while self._refusals:
-                reach.refused(*self._refusals.popleft())
+                stamp_ns, why = self._refusals.popleft()
+                reach.refused(self._arm.answered(stamp_ns), why)
             # what is seen
             seen, missing = self._inputs.look()
             if self._goal.changed(accepted):
@@ -294,11 +295,12 @@ class VisualMpcNode(LifecycleBase):
                 reach.set_targets(targets, time.monotonic())
                 continue
             # Before sending: the picture that answers may come at once.
-            newest_ns = self._inputs.newest_stamp()
+            newest_ns, age_ns = self._inputs.newest_picture()
             if isinstance(answer, Command) and self._send(handle, accepted, reach, answer):
                 period_ns = int(1e9 * self.params['control_period'])
-                reach.sent(newest_ns + 9 * period_ns // 10, time.monotonic(),
-                           period_ns if answer.seen.received < math.inf else 0)
+                reach.sent(
+                    newest_ns + 9 * period_ns // 10, time.monotonic(),
+                    max(period_ns, age_ns) if answer.seen.received < math.inf else 0)
                 result.steps = reach.steps
                 self._publish_progress(handle, reach, answer)
             else:

@@ -114,10 +114,12 @@ class PlannerInputs:
             self._seen, received=received, scene_ns=begun_ns if known else 0, jumps=jumps)
         return self._seen, missing
 
-    def newest_stamp(self) -> int:
-        """Return the stamp of the newest picture that has come with its joints, in ns."""
+    def newest_picture(self) -> tuple[int, int]:
+        """Return stamp and age, ns, of the newest picture that has come with its joints."""
         found = self._newest('image')
-        return found[0].stamp_ns if found is not None else -1
+        if found is None:
+            return -1, 0
+        return found[0].stamp_ns, int(1e9 * (time.monotonic() - found[2]))
 
     def cut(self, picture: np.ndarray, name: str) -> np.ndarray:
         """

@@ -56,7 +56,7 @@ function listObjects() {
       clicks.splice(k, 1);
       showClicks();
     }), {title: 'leave this one out', ariaLabel: `not ${one.name}`})]
-    : [mark(colourOf(one.name)), one.name, ...one.state ? [': ', mark(STATE_COLOURS[one.state]), `${one.state}, ${Math.round(100 * one.confidence)} %`] : []]));
+    : [mark(colourOf(one.name)), one.name, ...one.state ? [': ', mark(STATE_COLOURS[one.state]), `${one.state}, ${Math.round(100 * one.confidence)}%`] : []]));
 }
 
 function addClick({u, v, outline}) {
