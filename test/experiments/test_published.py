@@ -25,7 +25,7 @@ from experiments.tables import (
 )
 from experiments.worlds import command
 import numpy as np
-from pandas import read_csv
+from pandas import DataFrame, read_csv
 import pytest
 from tap_ros.evaluation.intervals import Interval, share_interval
 
@@ -116,6 +116,10 @@ def test_the_sentences_of_the_readme_are_those_of_the_data():
     gain = find(RESULTS, PREDICTION, task='push2', method=GENMIN, **GAIN)['value']
     assert (f"the error is {gain:.0%} below a fixed time's (the paper reports "
             f'{published.GAINS["push2"]:.0%})') in text
+    again = DataFrame(json.loads((RESULTS / 'worlds_loop_again.json').read_text()))
+    ends = again.groupby('method')['ends'].mean()
+    assert ('Trained again on another machine, predicted subgoals have {:.0%}, keyframes of '
+            'demonstrations {:.0%}').format(ends['subgoal'], ends['retrieval']) in text
     real = json.loads((RESULTS / 'real.json').read_text())['30']
     (error, _, off), (keyframe_error, _, keyframe_off) = (
         np.concatenate(real[way], 1) for way in (WAYS['three'][0], 'most alike keyframes'))
