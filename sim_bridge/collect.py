@@ -140,11 +140,15 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
         tasks = [Work(_shard_path(folder, i).name, _collect_shard, (str(folder), config, i, make))
                  for i in missing]
         with Progress(total=total, unit='episode', disable=not progress) as bar:
-            for _, get in run_tasks(tasks, engine):
-                found = get()
-                _note_bottlenecks(folder, [row['mark'] for row in found if row['mark']])
-                rows += found
-                bar.update(len(found))
+            try:
+                for _, get in run_tasks(tasks, engine):
+                    found = get()
+                    _note_bottlenecks(folder, [row['mark'] for row in found if row['mark']])
+                    rows += found
+                    bar.update(len(found))
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt(
+                    'files that are finished stay, the same command goes on') from None
         seconds = {'wall': time.perf_counter() - start, **{
             name: sum(row[name] for row in rows) for name in ('act', 'write')}}
         write_metadata(folder)

@@ -114,6 +114,16 @@ def test_what_was_killed_goes_on_to_the_same_files(whole, tmp_path):
     assert contents(folder) == contents(whole)
 
 
+def test_an_interrupted_collection_says_how_it_goes_on(tmp_path):
+    folder = tmp_path / 'push'
+    process = subprocess.Popen(command(folder, SMALL), stderr=subprocess.PIPE, text=True)
+    while not list(folder.glob('*.mcap*')) and process.poll() is None:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and 'the same command goes on' in said.splitlines()[-1]
+
+
 def test_a_folder_is_never_mixed_with_other_settings(whole, tmp_path):
     before = contents(whole)
     for changes, named in (({'seed': 2}, 'seed'), ({'episodes': 2}, '3 episodes')):
