@@ -5,7 +5,7 @@ Predictions at the size of the pictures that were sent, by a network that sees s
 
 The network says where each pixel comes from. Its flow and masks, enlarged, read the pictures as
 they were sent, so what is copied stays as sharp as the camera; not in the paper. On a CPU, in 8
-bits: 7 to 8 ms more for 640x480 on one core.
+bits: about 10 ms more for 640x480 on one core.
 """
 
 from collections.abc import Sequence
