@@ -89,7 +89,7 @@ def main(line: CommandLine, arguments: Sequence[str] | None = None) -> int:
         message = (f'{place}{escaped(error.strerror or error)}; see whether the place is there, '
                    'yours and not full')
     except KeyboardInterrupt as error:
-        print('interrupted' + f'; {error}' * bool(str(error)), file=sys.stderr)
+        print('; '.join(['interrupted', *map(str, error.args)]), file=sys.stderr)
         # After one that left an exec(), as in making a dataclass, Python ends by SIGINT though it
         # was caught; the next exec() makes it forget that.
         exec('')

@@ -235,7 +235,8 @@ class Reach:
         """
         Return the End if another scene is seen, or an object cannot be found, else None.
 
-        To be asked again before a command is carried out, as planning takes time.
+        To be asked again before a command is carried out, as planning takes time: from where the
+        gripper stands then the move begins.
         """
         if seen is None:
             return None

@@ -94,8 +94,8 @@ def test_an_arm_that_refuses_everything_ends_the_goal_and_the_next_one_is_served
 
 def test_an_arm_that_begins_late_is_commanded_from_where_it_comes_to(rig, monkeypatch):
     there = first_pictures()[0].gripper + np.append(rig.plan.action[:3], 0)
-    period_ns, begins, messages = int(0.25e9), [], rig.world.messages
-    sent = Reach.sent
+    period_ns = int(1e9 * rig.planner.node.params['control_period'])
+    begins, messages, sent = [], rig.world.messages, Reach.sent
     monkeypatch.setattr(Reach, 'sent', lambda self, after_ns, *rest: (
         begins.append(after_ns + period_ns // 2), sent(self, after_ns, *rest)))
 

@@ -116,7 +116,8 @@ def test_what_was_killed_goes_on_to_the_same_files(whole, tmp_path):
 
 def test_an_interrupted_collection_says_how_it_goes_on(tmp_path):
     folder = tmp_path / 'push'
-    process = subprocess.Popen(command(folder, SMALL), stderr=subprocess.PIPE, text=True)
+    many = CollectConfig(**vars(SMALL) | {'episodes': 500})  # not done before it is interrupted
+    process = subprocess.Popen(command(folder, many), stderr=subprocess.PIPE, text=True)
     while not list(folder.glob('*.mcap*')) and process.poll() is None:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
