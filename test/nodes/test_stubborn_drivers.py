@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """visual_mpc_node with an arm that refuses, and drivers that are late, silent or repeat."""
 
+from collections import ChainMap
 import math
 import threading
 import time
@@ -112,11 +113,11 @@ def test_an_arm_that_begins_late_is_commanded_from_where_it_comes_to(rig, monkey
     np.testing.assert_allclose(rig.scenes[-1].gripper, there, atol=0.005)
 
 
-def test_refused_commands_that_are_stamped_with_now_do_not_count(rig):
-    rig.planner.node.set_parameters([Parameter('stamp_with_now', value=True)])
+def test_refused_commands_that_are_stamped_with_now_do_not_count(rig, monkeypatch):
+    arm = rig.planner.node._arm
+    monkeypatch.setattr(arm, '_params', ChainMap({'stamp_with_now': True}, arm._params))
     rig.arm.refusing = True
     result, moves = rig.reach(3)
-    rig.planner.node.set_parameters([Parameter('stamp_with_now', value=False)])
     assert result.end == 'aborted' and result.steps == 0 and moves == MOST_REFUSED
     assert 'protective stop' in result.message
 
