@@ -14,7 +14,7 @@ import numpy as np
 from tap_ros.base.contract import GOAL_TOLERANCE
 from tap_ros.base.errors import ConfigError, TrackingError
 from tap_ros.images.robot_mask import FreeView, trained_robot_mask
-from tap_ros.planning.action_sequences import DOWN
+from tap_ros.planning.action_sequences import DOWN, FULL
 from tap_ros.planning.cost import BLOCKED
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.reach import End, Observation, Reach, ReachConfig, SelectTargets
@@ -59,7 +59,7 @@ class PlannedEpisode:
 
 
 def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
-                reached=GOAL_TOLERANCE):
+                reached=GOAL_TOLERANCE, limits=FULL):
     """
     Push the objects of one scene.
 
@@ -67,6 +67,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
     :param predictor: SubgoalPredictor, for methods that predict.
     :param reached: px, mean over objects; nearer than this is there, 0: never. Or of the goal and
         of subgoals, (2,).
+    :param limits: action_sequences.Limits of the arm.
     :return: PlannedEpisode.
     """
     if method.predicted and predictor is None:
@@ -78,7 +79,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
     subgoals, refused, aborted = [], '', ''
     reached, passed = np.broadcast_to(reached, 2).tolist()
     reach = Reach(mpc, ReachConfig(
-        step_budget, method.switch, reached, rounds=method.rounds, passed=passed), seed)
+        step_budget, method.switch, reached, limits, rounds=method.rounds, passed=passed), seed)
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
     tracked, states, true_goal, follower = [], (), goal, None
     if method.tracking != 'ground_truth':

@@ -86,7 +86,7 @@ class Options:
 
     tasks: tuple[str, ...] = ('push-wall-v3',)
     episodes: int = 120
-    steps: int = 1000
+    steps: int = 3000
     predictor_steps: int = 1500
     methods: tuple[str, ...] = METHODS
     seeds: int = 1

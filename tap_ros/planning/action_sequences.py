@@ -45,10 +45,19 @@ DOWN = LOW + 0.02  # m; a gripper that is not lifted and higher than this stands
 
 @dataclass(frozen=True)
 class Limits:
-    """How far the arm may move in one control period, m; the contract's limits hold anyway."""
+    """How far the arm may move in one control period, and where; the contract's hold anyway."""
 
-    move: float = MOVE_LIMIT  # |x| and |y|
-    climb: float = CLIMB_LIMIT  # |z|
+    move: float = MOVE_LIMIT  # |x| and |y|, m
+    climb: float = CLIMB_LIMIT  # |z|, m
+    low: tuple[float, float] = WORKSPACE_LOW[:2]  # x, y of the gripper, m, least
+    high: tuple[float, float] = WORKSPACE_HIGH[:2]  # greatest
+
+    def __post_init__(self) -> None:
+        for name, value in (
+                ('move', min(self.move, MOVE_LIMIT)), ('climb', min(self.climb, CLIMB_LIMIT)),
+                ('low', tuple(map(max, self.low, WORKSPACE_LOW))),
+                ('high', tuple(map(min, self.high, WORKSPACE_HIGH)))):
+            object.__setattr__(self, name, value)
 
 
 FULL = Limits()
@@ -65,9 +74,12 @@ class SequenceShape:
     """
 
     def __init__(self, limits: Limits = FULL) -> None:
-        self.move_limit = min(limits.move, MOVE_LIMIT)
-        self.climb_limit = min(limits.climb, CLIMB_LIMIT)
-        self.push_limit = min(self.move_limit, PUSH_LIMIT)
+        self.limits, self.move_limit, self.climb_limit = limits, limits.move, limits.climb
+        self.push_limit = min(limits.move, PUSH_LIMIT)
+
+    def inside(self, places: np.ndarray) -> np.ndarray:
+        """Return places (..., 2) m, those outside the workspace at its edge."""
+        return places.clip(self.limits.low, self.limits.high)
 
     def first_gaussian(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and deviation (D,) to begin a search with."""
@@ -111,14 +123,16 @@ class SequenceShape:
         near = min(VERTICAL, max(self.climb_limit, 0.02))  # slow ones wait until it is done
         return climb, np.abs(missing) < near
 
-    def actions(self, parameters: np.ndarray, height: float) -> np.ndarray:
+    def actions(self, parameters: np.ndarray, gripper: np.ndarray) -> np.ndarray:
         """
         Expand parameters (N, D) to actions (N, HORIZON, 4), float32, gripper closed (0).
 
-        :param height: of the gripper now, m.
+        None leads out of the workspace, or farther out.
+
+        :param gripper: (4,) m, now.
         """
         moves, lifted, phase = split(parameters)
-        climb, sideways = self.climbs(lifted, phase, height)
+        climb, sideways = self.climbs(lifted, phase, gripper[2])
         segment = segments(phase)
         actions = np.zeros((len(parameters), HORIZON, 4), np.float32)
         actions[..., :2] = moves[np.arange(len(moves))[:, None], segment] * sideways[..., None]
@@ -127,12 +141,18 @@ class SequenceShape:
         low = segment >= lifted[:, None]
         slow = np.minimum(1, self.push_limit / np.maximum(length, 1e-9))
         actions[..., :2] *= np.where(low, slow, 1)[..., None]
+        here = np.broadcast_to(gripper[:2], actions[:, 0, :2].shape)
+        for move in actions[..., :2].swapaxes(0, 1):
+            wanted = here + move
+            here = wanted.clip(np.minimum(self.limits.low, here),
+                               np.maximum(self.limits.high, here))
+            move += here - wanted
         return actions
 
-    def rise(self, height: float) -> np.ndarray:
-        """Return actions (HORIZON, 4) that lift the gripper on the spot from a height, m."""
+    def rise(self, gripper: np.ndarray) -> np.ndarray:
+        """Return actions (HORIZON, 4) that lift the gripper (4,) on the spot."""
         still = np.array([0.0] * 2 * MOVES + [SEGMENTS, 0])
-        return self.actions(still[None], height)[0]
+        return self.actions(still[None], gripper)[0]
 
 
 def split(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -168,22 +188,13 @@ def landings(actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     """
     Find where, (N, 2) metres, the gripper comes down: passes DOWN; NaN if it does not.
 
-    The arm goes no farther than the edge of the workspace.
-
     :param actions: (N, HORIZON, 4); gripper: (4,).
     """
-    path, height = np.empty((*actions.shape[:2], 2)), gripper[2] + actions[..., 2].cumsum(1)
-    here = np.broadcast_to(gripper[:2], path[:, 0].shape)
-    for t in range(path.shape[1]):
-        path[:, t] = here = inside(here + actions[:, t, :2])
+    path, height = (gripper[at] + actions[..., at].cumsum(1, dtype=float)
+                    for at in (np.s_[:2], 2))
     down = (height - actions[..., 2] > DOWN) & (height <= DOWN)
     first = down.argmax(1)
-    return np.where(down.any(1)[:, None], path[np.arange(len(path)), first, :2], np.nan)
-
-
-def inside(places: np.ndarray) -> np.ndarray:
-    """Return places (..., 2) m, those outside the workspace at its edge."""
-    return places.clip(WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])
+    return np.where(down.any(1)[:, None], path[np.arange(len(path)), first], np.nan)
 
 
 def gripper_after(gripper: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -218,11 +229,11 @@ def push_proposals(shape: SequenceShape, gripper: np.ndarray, objects: np.ndarra
             along = np.array([np.cos(angle), np.sin(angle)])
             aside = rng.normal(0, 0.025) * np.array([-along[1], along[0]])
             start = objects[k] - rng.uniform(0.13, 0.16) * along + aside
-            if (start == inside(start)).all():
+            if (start == shape.inside(start)).all():
                 break
         # the gripper stops where the object's near side should end
         end = start + (distances[k] + rng.normal(0.07, 0.03)) * along
-        proposals.append(_go_and_push(shape, gripper, inside(start), end, objects[k], along))
+        proposals.append(_go_and_push(shape, gripper, shape.inside(start), end, objects[k], along))
     return np.stack(proposals)
 
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from tap_ros.base.contract import WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.planning.action_sequences import HORIZON
+from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
 from tap_ros.planning.table import pixel_points
 import torch
 
@@ -61,20 +60,21 @@ class PlanCost:
         before = (total - last.sum(1)) * (HORIZON - 1) / max(1, seen - 1)
         return before + LAST_WEIGHT * last.sum(1), last.mean(1)
 
-    def of_landings(self, landings: np.ndarray, objects: np.ndarray,
-                    blocked: np.ndarray) -> np.ndarray:
+    def of_landings(self, landings: np.ndarray, objects: np.ndarray, blocked: np.ndarray,
+                    limits: Limits = FULL) -> np.ndarray:
         """
         Cost of coming down upon an object, which recordings of good pushes do not show.
 
         :param landings: (N, 2) metres, NaN for none; objects: (K, 2).
         :param blocked: (B, 2), where the gripper met something; dearer than any push gains.
+        :param limits: of the arm: where its workspace ends.
         :return: (N,) pixels: 0, or 100 (1000 where blocked) and 10 for every centimetre that is
             missing; the latter alone within LEG of the clearance, and where the workspace ends:
             nothing is farther there, so narrow places are tried.
         """
         costs = np.zeros(len(landings))
         if self.clearance:
-            low, high = np.array(WORKSPACE_LOW[:2]) + EDGE, np.array(WORKSPACE_HIGH[:2]) - EDGE
+            low, high = np.array(limits.low) + EDGE, np.array(limits.high) - EDGE
             edge = ((landings < low) | (landings > high)).any(1)
             for places, near, least, room in (
                     (objects, np.where(edge, BLOCKED, self.clearance), 100, self.clearance + LEG),

@@ -29,6 +29,7 @@ from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
 MOST_UNSURE = 10  # pictures in a row in which an object is not known for sure; likewise
 MOST_LATE = 3  # plans in a row that took too long to be acted upon; likewise
+MOST_HELD, HELD = 3, 0.02  # moves, of which the message tells; m, shorter ones do not count
 SENDING = 0.1  # share of max_age that is left for sending a command
 MOVED = 0.8  # share of a move from which on a picture shows its effect
 
@@ -154,6 +155,7 @@ class Reach:
         self._next: _State | None = None
         self._refusal, self._refused = '', 0  # why the last command was refused; how many in a row
         self._late = 0  # plans in a row
+        self._held = 0  # moves through the air that the arm did not make
         self._sent_at = now  # of the last command, or when there was reason to wait
         self.steps, self.distance = 0, float('nan')
         self.pixels = np.empty((0, 2), np.float32)
@@ -231,6 +233,14 @@ class Reach:
         told = self._answered.plan.action[:3]
         return bool((seen.gripper - self._from)[:3] @ told < MOVED * (told @ told))
 
+    def _is_held(self) -> bool:
+        """Return whether the last move through the air went less than half as far as told."""
+        if self._answered is None:
+            return False
+        told, way = self._answered.plan.action[:2], (self._stood - self._from)[:2]
+        return bool(told @ told > HELD ** 2 and self._stood[2] > DOWN
+                    and way @ told < 0.5 * told @ told)
+
     def interrupted(self, seen: Observation | None) -> End | None:
         """
         Return the End if another scene is seen, or an object cannot be found, else None.
@@ -296,6 +306,7 @@ class Reach:
         assert command is not None and self._state is not None, 'a Command comes first'
         if self._before is not None:  # the command before this one was carried out
             self._refused = 0
+            self._held += self._is_held()
         self._before = self._state, self._answered, self._sent_at
         self._sent_at = now
         self._state, self._answered = self._next, command
@@ -332,7 +343,10 @@ class Reach:
         if self.distance <= config.reached and UNSURE not in seen.states:
             return End('reached', 'reached')
         if self.steps >= self._budget:
-            return End('spent', f'stopped, as the step budget of {self._budget} is spent')
+            held = self._held + self._is_held()
+            return End('spent', f'stopped, as the step budget of {self._budget} is spent' + (
+                f'; {held} moves through the air went less than half as far as told: the arm may '
+                'not reach that far, limit its workspace' if held >= MOST_HELD else ''))
         if UNSURE in seen.states:  # nothing is pushed by a place that is not believed
             plan = self._mpc.aside(seen.gripper, self.distance, state.memory, config.limits)
             self._next = replace(state, memory=plan.memory)

@@ -260,7 +260,7 @@ class VisualMPC:
             replace(memory, blocked=blocked))
         # say where it ends; its first action is the answer
         parameters = np.concatenate([found.best[None], found.elites])
-        actions, *elites = shape.actions(parameters, gripper[2])
+        actions, *elites = shape.actions(parameters, gripper)
         _, (end,) = self.rollouts.judge(
             start, goal.distances, actions[None], gripper[None], HORIZON)
         left, *kept = map(shift, parameters)
@@ -272,7 +272,7 @@ class VisualMPC:
     @staticmethod
     def aside(gripper: np.ndarray, distance: float, memory: Memory, limits: Limits) -> Plan:
         """Go straight up, by no object's place; distance: px, the Plan's expected_distance."""
-        actions = SequenceShape(limits).rise(gripper[2])
+        actions = SequenceShape(limits).rise(gripper)
         return Plan(actions[0], distance, 0.0, actions, actions[None], math.nan, 0,
                     Memory(memory.seed, memory.count + 1, blocked=memory.blocked))
 
@@ -289,8 +289,9 @@ class VisualMPC:
 
         # mean over where the gripper begins
         def cost(samples: np.ndarray, grippers: np.ndarray = gripper[None]) -> np.ndarray:
-            actions = shape.actions(samples, gripper[2])
-            clash = self.cost.of_landings(landings(actions, gripper), here, blocked)
+            actions = shape.actions(samples, gripper)
+            clash = self.cost.of_landings(
+                landings(actions, gripper), here, blocked, shape.limits)
             costs, _ = self.rollouts.judge(
                 start, prices, actions.repeat(len(grippers), 0),
                 np.tile(grippers, (len(samples), 1)), config.cost_every)

@@ -18,12 +18,13 @@ from processes import Client, Lifecycle, Newest, until
 import pytest
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.task import Future
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Bool, String
 from tap_msgs.action import ReachGoal
 import tap_ros
 from tap_ros.apps.node_processes import NodeProcesses
 from tap_ros.messages.images import decode_image
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.planner.plan_view import CHOSEN
 from tap_ros.planning.mpc_config import PRESETS
 from tap_ros.ros import reaching
@@ -111,6 +112,30 @@ def test_the_nodes_go_directly_as_one_process_does_and_within_limits(loop):
     limit = np.array([0.02, 0.02, 0.04])
     assert (np.abs(loop.moves()) <= limit + 1e-6).all()
     assert (np.abs(loop.moves()).max(0) > 0.5 * limit).any(), 'it plans within them'
+
+
+def test_the_gripper_does_not_leave_the_workspace_that_it_is_given(loop):
+    def go(**limits):
+        """Return where the gripper began and where the commands of four steps led, x and y."""
+        loop.reset()
+        stamp = loop.client.camera().stamp_ns
+        state = joints.wait(10, lambda found: to_nanoseconds(found.header.stamp) >= stamp)
+        here = np.array([state.position[state.name.index(f'gripper_{axis}')] for axis in 'xy'])
+        with loop.set(**limits):
+            assert loop.reached(mode='direct', step_budget=4, seed=5).steps == 4
+        return here, here + loop.moves()[:, :2].cumsum(0)
+
+    joints = Newest(loop.node, JointState, 'joint_states', STREAM)
+    here, free = go()
+    way = free[-1] - here
+    axis = int(np.abs(way).argmax())
+    end = here[axis] + 0.3 * way[axis]
+    name = 'xy'[axis] + ('_max' if way[axis] > 0 else '_min')
+    _, bound = go(**{name: float(end)})
+    assert ((bound[:, axis] - end) * np.sign(way[axis]) < 1e-3).all()
+    assert np.abs(bound - here).max() > 0.01, 'it plans within it'
+    with loop.set(x_min=0.1, x_max=0.12):
+        aborted(loop, 'x_min and x_max', '0.1 to 0.12 m', 'less than 0.05 m')
 
 
 def test_the_nodes_go_by_subgoals_as_one_process_does_and_tell_what_they_do(loop):

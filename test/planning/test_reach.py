@@ -69,6 +69,21 @@ def test_one_command_a_picture_until_the_budget_is_spent(mpc):
     assert reach.distance == pytest.approx(4) and 'budget of 3 is spent' in end.message
 
 
+@pytest.mark.parametrize('share, tells', [(0.0, True), (0.3, True), (0.9, False)])
+def test_a_spent_goal_tells_of_moves_that_the_arm_did_not_make(mpc, monkeypatch, share, tells):
+    plan = mpc.plan
+    monkeypatch.setattr(mpc, 'plan', lambda *args: replace(
+        plan(*args), action=np.array([0.05, -0.03, 0, 0], np.float32)))
+    reach, gripper = begun(mpc, ReachConfig(4)), np.array([0, 0, 0.13, 0], np.float32)
+    for t in range(4):
+        answer = reach.step(look(t, gripper=gripper))
+        reach.sent()
+        gripper = gripper + np.float32(share) * answer.plan.action
+    message = reach.step(look(4, gripper=gripper)).message
+    assert ('4 moves through the air went less than half as far as told' in message) == tells
+    assert 'budget of 4 is spent' in message
+
+
 def test_a_goal_that_is_reached_ends_at_once_and_the_default_budget_is_the_papers(mpc):
     reach = begun(mpc, ReachConfig())
     assert reach._budget == 40

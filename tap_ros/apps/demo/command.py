@@ -295,7 +295,7 @@ class NodeSet:
         if subgoals:
             begin('predictor_node', robot_mask=args.robot_mask, weights=args.weights(task))
         begin('visual_mpc_node', weights=args.forward_model, robot_mask=args.robot_mask,
-              preset='quick', subgoal_rounds=args.rounds(task), **PATIENT)
+              arm=args.arm, preset='quick', subgoal_rounds=args.rounds(task), **PATIENT)
 
     def close(self) -> None:
         """End the nodes."""

@@ -13,6 +13,8 @@ from tap_ros.base.contract import (
     MOVE_LIMIT,
     SPEED_LIMIT,
     step_budget,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
     WORLD_FRAME,
 )
 from tap_ros.base.errors import ConfigError, TapError
@@ -21,10 +23,13 @@ from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_config import PRESETS, SWITCHES, with_preset
 from tap_ros.planning.reach import ReachConfig
 from tap_ros.planning.visual_mpc import Scene, VisualMPC
+from tap_ros.robots.arm import get_arm
 from tap_ros.ros.parameters import check_device, Parameters, setting
 from tap_ros.weights import find_forward_model, FORWARD_MODELS
 
 MODES = ('subgoal', 'direct')
+WORKSPACE_X, WORKSPACE_Y = tuple(zip(WORKSPACE_LOW, WORKSPACE_HIGH))[:2]  # m
+ROOM = 0.05  # m, along x and y
 MAX_BUDGET = 1000
 MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
 
@@ -46,6 +51,12 @@ class PlannerParameters:
         knows it, from the next goal on.
     :param max_step_z: Largest |dz| of a command in metres, 0.6 m/s at most; the planner
         knows it, from the next goal on.
+    :param x_min: Where the fingertips may go, m in the frame world, least x. Commands do not lead
+        farther; the planner knows it, from the next goal on. By default the arm's own reach at its
+        usual mount, likewise x_max, y_min and y_max.
+    :param x_max: Greatest x, m.
+    :param y_min: Least y, m.
+    :param y_max: Greatest y, m.
     :param goal_tolerance: A goal is reached at this mean distance of the objects, in pixels of the
         forward model's pictures, a subgoal where the mean expected distance to its maps is so much
         above the least possible.
@@ -71,6 +82,10 @@ class PlannerParameters:
     command_frame: str = WORLD_FRAME
     max_step_xy: float = setting(MOVE_LIMIT, between=(0.001, MOVE_LIMIT), read_only=False)
     max_step_z: float = setting(CLIMB_LIMIT, between=(0.02, CLIMB_LIMIT), read_only=False)
+    x_min: float = setting(WORKSPACE_LOW[0], between=WORKSPACE_X, read_only=False)
+    x_max: float = setting(WORKSPACE_HIGH[0], between=WORKSPACE_X, read_only=False)
+    y_min: float = setting(WORKSPACE_LOW[1], between=WORKSPACE_Y, read_only=False)
+    y_max: float = setting(WORKSPACE_HIGH[1], between=WORKSPACE_Y, read_only=False)
     goal_tolerance: float = setting(GOAL_TOLERANCE, between=(0.0, 64.0), read_only=False)
     switch: str = setting('reached', choices=SWITCHES, read_only=False)
     subgoal_rounds: int = setting(1, between=(1, 16), read_only=False)
@@ -91,8 +106,11 @@ def declare_parameters(node: Node) -> Parameters:
                        f'({", ".join(FORWARD_MODELS)}), or a file (.safetensors). Can be '
                        'changed while the node is unconfigured.',
                        read_only=False)
-    parameters.declare_fields(PlannerParameters)
     parameters.declare_arm()
+    arm = get_arm(parameters['arm'])
+    low, high = np.clip((arm.low, arm.high), WORKSPACE_LOW, WORKSPACE_HIGH).tolist()
+    parameters.declare_fields(PlannerParameters, x_min=low[0], x_max=high[0], y_min=low[1],
+                              y_max=high[1])
     return parameters
 
 
@@ -124,9 +142,20 @@ def load_planner(parameters: Parameters) -> VisualMPC:
 
 
 def step_limits(parameters: Parameters) -> Limits:
-    """Return how far the arm may move by one command; it is never faster than SPEED_LIMIT."""
+    """
+    Return how far the arm may move by one command, and where; never faster than SPEED_LIMIT.
+
+    :raises ConfigError: for a workspace without room.
+    """
     move, _, climb = (parameters['control_period'] * speed for speed in SPEED_LIMIT)
-    return Limits(min(parameters['max_step_xy'], move), min(parameters['max_step_z'], climb))
+    for low, high in (('x_min', 'x_max'), ('y_min', 'y_max')):
+        if parameters[high] - parameters[low] < ROOM:
+            raise ConfigError(
+                f'parameters {low} and {high}: {parameters[low]:g} to {parameters[high]:g} m '
+                f'leaves less than {ROOM:g} m to move in; correct them')
+    return Limits(min(parameters['max_step_xy'], move), min(parameters['max_step_z'], climb),
+                  (parameters['x_min'], parameters['y_min']),
+                  (parameters['x_max'], parameters['y_max']))
 
 
 def reach_config(parameters: Parameters, request: ReachGoal.Goal) -> ReachConfig:
