@@ -46,7 +46,7 @@ from tqdm import tqdm
 BAGS = {'random': 100_000, 'goal': 0}  # of pushes; the first seed
 METHODS = (*UNTRAINED, *PLANNED)
 FILMED = ('subgoal', 'places')  # the first that is there beside direct
-LEARNED = ('fixed time', 'subgoal')  # methods that are trained anew by each seed
+LEARNED = ('fixed time', 'subgoal')  # of which each seed trains all networks anew
 RESULTS = Path(__file__).parents[2] / 'docs' / 'results'
 MARKED, MOVED = 12, 1.0  # demonstrations; px, beyond which an object has begun to move
 AT, RESTS, JOLT = 0.06, 0.005, 0.025  # m: by the way; in a period of rest; as the hand leaves
@@ -72,10 +72,11 @@ class Options:
     :param tasks: in which objects slide on a table in view of the camera: of Meta-World, such as
         push-v3 and plate-slide-v3, where nothing is in the way, or world/task.
     :param episodes: of each bag: demonstrations, and pushes at random.
-    :param steps: of the training of each task's forward model.
-    :param predictor_steps: of the training of each task's predictors.
+    :param steps: of the training of each forward model.
+    :param predictor_steps: of the training of each predictor.
     :param methods: that act in each scene.
-    :param seeds: trainings of each predictor.
+    :param seeds: trainings of a forward model and of each predictor; the other methods plan with
+        the first forward model.
     :param scenes: of each task; those are left out whose goal the script of the environment's
         authors does not bring about.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
@@ -134,18 +135,19 @@ def make_weights(args, task, seed):
     """Make bags and trainings of a task; return Weights by method."""
     bag, runs, ways = Path(args.bags, task), Path(args.runs, task), WAYS.get(task, ())
     world, _, name = task.rpartition('/')
-    planned = [method for method in args.methods if method in PLANNED]
+    planned = [method for method in args.methods
+               if method in PLANNED and (seed == 0 or method in LEARNED)]
     if not planned:
         return {}
     for pushes, first in BAGS.items():
         collect(bag / pushes, CollectConfig(
             world=world or 'metaworld', task=name, pushes=pushes, episodes=args.episodes,
             seed=first, image_size=IMAGE_SIZE, episodes_per_file=10), args.engine)
-    forward = str(train([bag / pushes for pushes in BAGS], runs / 'forward', 'forward',
-                        steps=args.steps, **FORWARD))
+    forward = str(train([bag / pushes for pushes in BAGS], runs / f'forward_{seed}', 'forward',
+                        steps=args.steps, seed=seed, **FORWARD))
     marks = str(mark(bag / 'goal', ways))
     weights = {method: Weights(forward, '', f'{bag / "goal"}{os.pathsep}{marks}')
-               for method in planned if seed == 0 or method in LEARNED}
+               for method in planned}
     how = {'fixed time': {'loss': 'fix'}, 'subgoal': {'selection': 'marks', 'marks': marks}}
     if ways:
         timed = str(mark_times(bag / 'goal', len(ways)))
