@@ -12,7 +12,7 @@ from tap_ros.base.contract import ACTION_LIMIT, SPEED_LIMIT
 from tap_ros.base.errors import ConfigError
 from tap_ros.nodes.planner.arm import ArmCommander
 from tap_ros.nodes.planner.settings import declare_parameters, step_limits
-from tap_ros.planning.action_sequences import SequenceShape, SIZE
+from tap_ros.planning.action_sequences import FULL, SequenceShape, SIZE
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.topics import STREAM, to_stamp
 
@@ -60,6 +60,18 @@ def test_no_action_is_faster_than_the_limits_whatever_the_control_period(command
         assert (np.abs(sent) * period <= np.array(ACTION_LIMIT) + 1e-9).all()
     planned = SequenceShape(step_limits(params)).clip(np.full((1, SIZE), 1e30))
     np.testing.assert_allclose(planned[0, 0] / period, sent[0], err_msg='the planner knows it')
+
+
+def test_the_workspace_is_by_default_the_reach_of_the_arm_and_within_the_contracts():
+    given = [Parameter('arm', value='panda'), Parameter('x_max', value=0.1)]
+    with Client(parameter_overrides=given) as node:
+        limits = step_limits(declare_parameters(node))
+    assert (limits.low, limits.high) == ((-0.4, -0.16), (0.1, 0.16))
+    with Client() as node:
+        assert step_limits(declare_parameters(node)) == FULL
+    with (Client(parameter_overrides=[Parameter('y_min', value=-0.5)]) as node,
+          pytest.raises(ConfigError, match='y_min.*-0.45')):
+        declare_parameters(node)
 
 
 def test_what_the_planner_says_itself_hides_no_other_time_that_the_arm_has_told():

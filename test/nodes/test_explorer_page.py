@@ -129,7 +129,7 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
             page.click('#follow')
             page.wait_for_selector('#error:not(:empty)')
             assert page.inner_text('#error') == (
-                'not taken: thumb is on nothing; click on an object')
+                'not taken: thumb is on nothing; leave it out (✕), or click on an object')
             assert page.locator('#follow').bounding_box() == before, 'nothing moves'
             page.fill('#clicks li:last-child input', 'ring')
             page.click('#follow')
@@ -149,7 +149,7 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
             page.reload()
             page.wait_for_function(
                 "$('hint').textContent.startsWith('No goal known yet for: object_0, ring.')")
-            assert says(page, 'goal') == 'drag to their goals: object_0, ring'
+            assert says(page, 'goal') == 'drag object_0, ring to their goals'
         page.wait_for_function("/silent/.test($('step-scene').textContent)")
         assert 'photograph' not in page.evaluate(LIVE)
 
@@ -164,7 +164,7 @@ def test_outlines_turn_with_objects_and_a_goal_that_is_moved_is_not_gone_on_to(e
         camera = Camera(node)
         page.wait_for_function('pictures.camera && state.tracker && state.camera.width')
         page.mouse.click(*at(page, *CUP))
-        assert page.inner_text('#follow') == 'use this 1 object'
+        assert page.inner_text('#follow') == 'use this object'
         page.click('#follow')
         page.wait_for_function('outlines.object_0 && state.camera.objects.length')
         assert np.abs(np.subtract(turned(page, 'object_0'), OUTLINE)).max() < 0.11

@@ -8,12 +8,18 @@ import json
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
+from processes import Client
 import pytest
+from tap_msgs.srv import SelectObjects
 from tap_ros.apps.explorer import events, words
 from tap_ros.apps.explorer.browser_commands import COMMANDS, REFUSED
-from tap_ros.apps.explorer.display import simulated
+from tap_ros.apps.explorer.display import Display, simulated
 from tap_ros.apps.explorer.events import Events
-from tap_ros.apps.explorer.words import NodeStates, plain, renamed
+from tap_ros.apps.explorer.words import clicks_named, NodeStates, plain, renamed
+from tap_ros.base.errors import TrackingError
+from tap_ros.tracking.protocols import View
+from tap_ros.tracking.rigid_tracker import RigidTracker
+from visualization_msgs.msg import ImageMarker
 
 OK, WARN, ERROR, STALE = (getattr(DiagnosticStatus, level)
                           for level in ('OK', 'WARN', 'ERROR', 'STALE'))
@@ -128,3 +134,22 @@ def test_events_have_times_and_the_picture_of_soon_after_and_are_few(monkeypatch
     shown['camera'] = np.zeros((4000, 2, 3), np.uint8)
     happened.look()
     assert len(happened.text) < 200_000
+
+
+def test_a_refused_click_is_called_as_its_object():
+    plane = np.random.default_rng(0).integers(90, 94, (256, 256, 3), np.uint8)
+    clicks = [{'name': 'cup', 'u': 100, 'v': 40.04}, {'name': 'ring', 'u': 30.5, 'v': 200}]
+    with pytest.raises(TrackingError) as refused:
+        RigidTracker().select(View(plane), [(one['u'], one['v']) for one in clicks])
+    assert clicks_named(str(refused.value), clicks) == (
+        'cup is on nothing that differs from the table around it; leave it out (✕), or click '
+        'on an object')
+
+
+def test_outlines_of_earlier_objects_are_not_those_of_new_ones_of_the_same_names():
+    with Client('shows') as node:
+        shown = Display(node)
+        for followed, left in ((False, 1), (True, 0)):
+            shown.outlines['object_0'] = ImageMarker()
+            shown.select(SelectObjects.Response(), followed)
+            assert len(shown.outlines) == left

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from tap_msgs.action import ReachGoal
 from tap_ros.apps.explorer.display import Display, GoalByHand, simulated
-from tap_ros.apps.explorer.words import plain, renamed
+from tap_ros.apps.explorer.words import clicks_named, plain, renamed
 from tap_ros.base.contract import step_budget
 from tap_ros.base.errors import TapError
 from tap_ros.base.text import escaped
@@ -108,6 +108,7 @@ class ExplorerCalls:
         self._lock = threading.Lock()
         self._goal: Reaching | None = None
         self._asked = self._cancelled = self._ending = False  # asked: by a browser, for a goal
+        self._ours = False  # the goal under way was asked for by a browser
         self._stage, self._most = '', 0  # most steps of the goal
         self.forget_end()
         self._under_way = False  # a goal, whoever sent it
@@ -130,8 +131,10 @@ class ExplorerCalls:
     @property
     def stage(self) -> str:
         """What the goal in progress is doing."""
+        if self._cancelled:
+            return 'cancelling'
         return self._client.silence('visual_mpc_node') or self._stage or (
-            "another client's goal" if not self._asked else '')
+            'ending' if self._ours else "another client's goal" if not self._asked else '')
 
     def forget_end(self, said: str = '', reached: bool = False, spent: bool = False) -> None:
         """Forget how the last goal ended: there is another one, or it ended in another way."""
@@ -157,7 +160,7 @@ class ExplorerCalls:
             if do == 'reach':
                 if self.running:
                     raise CommandError('a goal is in progress; cancel it or wait for its end')
-                self._asked, self._cancelled = True, False
+                self._asked, self._ours, self._cancelled = True, True, False
         pool = self._cancelling if do == 'cancel' else self._pool
         pool.submit(self._carry_out, do, fields)
 
@@ -174,6 +177,8 @@ class ExplorerCalls:
 
     def _on_status(self, message: GoalStatusArray) -> None:
         self._under_way = any(one.status in UNDER_WAY for one in message.status_list)
+        if not (self._under_way or self._asked):
+            self._ours = self._cancelled = False
         self._planner = publishers_present(self._node, STATUS) if self._under_way else None
 
     # In the threads of the pool
@@ -212,12 +217,15 @@ class ExplorerCalls:
                 self._display.events.add(f'the predictor has the weights of {task} now')
 
     def _select(self, objects: list[dict[str, Any]]) -> None:
-        response = self._call('select', names=[one['name'] for one in objects],
-                              u=[float(one['u']) for one in objects],
-                              v=[float(one['v']) for one in objects])
+        try:
+            response = self._call('select', names=[one['name'] for one in objects],
+                                  u=[float(one['u']) for one in objects],
+                                  v=[float(one['v']) for one in objects])
+        except CallError as error:
+            raise CallError(clicks_named(str(error), objects)) from error
         self._on_selected()
         self._display.select(response, followed=True)
-        self._display.events.add(escaped(response.message, 1000),
+        self._display.events.add(clicks_named(escaped(response.message, 1000), objects),
                                  problem=len(response.objects) < len(objects))
 
     def _propose(self) -> None:

@@ -71,6 +71,8 @@ class Display:
     def select(self, response: SelectObjects.Response, followed: bool) -> None:
         """Show outlines of objects that are followed from now on, or that are proposed."""
         self._selections += 1
+        if followed:
+            self.outlines.clear()  # of others, which may have had the same names
         self.selection = json.dumps({
             'kind': 'selection', 'count': self._selections, 'followed': followed,
             'objects': [{'name': escaped(one.name, 100), 'u': one.u, 'v': one.v,

@@ -146,6 +146,7 @@ class ExplorerNode(Node):
             self._scenes += 1
             with self._display.lock:
                 self._display.selection = display.NOTHING_SELECTED
+                self._display.outlines.clear()
                 if self._calls.offered('reset'):  # stamps are the simulator's
                     self._scene_ns = to_nanoseconds(message.header.stamp)
                 self._forget('subgoal', 'plan')

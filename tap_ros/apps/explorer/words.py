@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What nodes say of themselves, and why they refuse, in words instead of topics."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 import re
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from tap_ros.base.text import escaped
@@ -31,6 +32,14 @@ def renamed(text: str, names: Mapping[str, str]) -> str:
     """Return a text in which objects are called otherwise; names: {there: here}."""
     any_of = '|'.join(map(re.escape, names))
     return re.sub(rf'(?<!\w)(?:{any_of})(?!\w)', lambda found: names[found[0]], text)
+
+
+def clicks_named(text: str, objects: Iterable[Mapping[str, Any]]) -> str:
+    """Return what the tracker says of clicks, each called as its object, and what helps here."""
+    for one in objects:
+        at = tuple(round(float(one[axis]), 1) for axis in 'uv')
+        text = text.replace(f'click {at}', one['name'])
+    return text.replace('; click on an object', '; leave it out (✕), or click on an object')
 
 
 def word(topic: str) -> str:

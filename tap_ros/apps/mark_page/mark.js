@@ -4,6 +4,7 @@
 
 const THUMBNAILS = 14;
 const ASK_AGAIN_MS = 1500;  // while labels are being found
+const LABELLING = 3;  // marked demonstrations, from which on others are labelled
 const BESIDE_S = 0.5;  // between a label and where the hand moves, which is taken for it
 let state = null;    // what the server knows
 let about = null;    // of the demonstration that is shown: seconds of its frames, moves of its gripper
@@ -16,8 +17,9 @@ const seen = [];     // demonstrations shown before
 const passed = new Set();  // shown and left unmarked
 let done = Promise.resolve();  // when the server has all marks
 
+const SILENT = 'The server does not answer: start mark again, then load this page again.';
 const names = () => state.names;
-const say = (text) => { $('said').textContent = text; };
+const say = (text, good = false) => { $('said').textContent = text; $('said').className = good ? 'good' : 'bad'; };
 const second = (t) => `${about.seconds[t].toFixed(1)} s`;
 const nameOf = (k) => names()[k] || (draft.length > 1 || !names().length ? `mark ${k + 1}` : '');
 const isSaved = () => String(draft) === String(state.marks[episode] || []);
@@ -68,7 +70,8 @@ function draw() {
   $('now').classList.toggle('marked', draft.includes(frame));
   $('where').textContent = `${second(frame)} of ${second(last)}, frame ${frame} of ${last}`;
   $('count').textContent = count < state.enough ? `${count} of ${state.enough} marked` : `${count} marked: enough`;
-  $('busy').textContent = state.busy ? 'finding labels …' : '';
+  $('count').className = count < state.enough ? '' : 'good';
+  $('busy').textContent = state.busy && count >= LABELLING ? 'finding labels …' : '';
   $('play').textContent = playing ? 'Stop' : 'Play';
   const listed = draft.map((t, k) => t === null ? `${nameOf(k)} not yet` : `${nameOf(k)} ${second(t)}`);
   const guess = labels().map(([t, sure], k) => `${names()[k] || ''} ${second(t)} (confidence ${Math.round(100 * sure)}%)`);
@@ -81,15 +84,22 @@ function draw() {
     one.className = (draft.some((t) => t !== null && inside(t)) ? 'marked ' : labels().some(([t]) => inside(t)) ? 'labelled ' : '') +
       (inside(frame) ? 'here' : '');
   }
-  const free = Math.max(0, draft.indexOf(null));  // what Enter marks
-  fill($('names'), names().length ? names() : ['Mark'], (name, k) => Object.assign(
-    button(names().length ? `${k + 1} ${name}` : name, () => mark(names().length ? k : null)), {className: k === free ? 'main' : ''}));
-  const offer = added();
+  // The main button is what comes next: to accept, to mark (as Enter does), or the next demonstration.
+  const offer = added(), named = names().length > 0;
+  const free = offer.length || !(named ? draft.includes(null) || !draft.length : !draft.length) ? -1 : Math.max(0, draft.indexOf(null));
+  fill($('names'), named ? names() : ['this moment'], (name, k) => Object.assign(
+    button(` ${name}${named ? ` (${k + 1})` : ''}`, () => mark(named ? k : null)), {className: k === free ? 'main' : ''}));
+  [...$('names').children].forEach((one, k) => one.prepend(  // of one width, so that nothing moves
+    made('span', {}, (named ? draft[k] === frame : draft.includes(frame)) ? 'undo' : 'mark')));
+  $('accept').className = 'main';
+  $('next').className = free < 0 && !offer.length ? 'main' : '';
+  $('previous').disabled = !seen.length;
   $('accept').hidden = !offer.length;
   $('accept').textContent = `accept ${offer.map(([t, k]) => `${nameOf(k)} ${second(t)}`.trim()).join(', ')} (a)`;
   fill($('list'), Object.entries(state.marks), ([i, frames]) => made('li', {className: Number(i) === episode ? 'here' : ''},
     button(`${i}: ${state.seconds[i].map((s) => `${s.toFixed(1)} s`).join(', ')}`, () => { visit(Number(i), frames[0]); })));
   if (!count) $('list').append(made('li', {className: 'soft'}, 'What you mark is listed here.'));
+  document.body.classList.toggle('enough', state.commands.length > 0);
   fill($('commands'), state.commands, (words) => made('pre', {}, words));
   if (state.commands.length) $('commands').prepend(
     made('p', {}, 'Enough to begin with. In a terminal, label all demonstrations, or train on the marks:'));
@@ -115,7 +125,7 @@ function drawTicks(last) {
 
 async function open(i, wanted) {
   const answer = await fetch(`about/${i}`).catch(() => null);
-  if (!answer || !answer.ok) { say('The server does not answer. Start it again.'); return; }
+  if (!answer || !answer.ok) { say(SILENT); return; }
   about = await answer.json();
   episode = i;
   playing = false;
@@ -177,7 +187,7 @@ function send(frames) {
   draw();
   if (missing.length && !state.marks[i]) return;
   done = done.then(async () => {
-    let text = 'Not marked: the server does not answer. Start it again.';
+    let text = `Not marked. ${SILENT}`;
     try {
       const answer = await fetch('mark', {method: 'POST', body: JSON.stringify({episode: i, frames: sent})});
       if (answer.ok) { take(await answer.json()); text = ''; } else text = `Not saved: ${await answer.text()}`;
@@ -209,17 +219,19 @@ async function next() {
     passed.clear();
     fresh = left;
   }
-  if (!fresh.length) { say(state.order.length ? 'This is the only one that is not marked.' : 'All are marked.'); return; }
+  if (!fresh.length) { say(state.order.length ? 'This is the only one that is not marked.' : 'All are marked.', true); return; }
   await visit(fresh[0]);
-  say(text);
+  if (text) say(text, true);
 }
 
-function visit(i, wanted) {
+async function visit(i, wanted) {
   if (i !== episode) seen.push(episode);
-  return open(i, wanted);
+  await open(i, wanted);
+  $($('said').textContent ? 'said' : 'shown').scrollIntoView({block: 'nearest'});
 }
 
 function previous() {
+  say('');
   if (seen.length) open(seen.pop());
 }
 
@@ -260,6 +272,7 @@ document.addEventListener('keydown', (event) => {
 document.addEventListener('click', (event) => { if (event.detail) document.activeElement.blur(); });  // of a pointer
 $('slider').oninput = () => go(Number($('slider').value));
 $('now').onclick = () => mark();
+$('now').onerror = () => say(SILENT);
 $('now').onload = () => $('now').classList.toggle('small', $('now').naturalWidth < 200);
 $('next').onclick = next;
 $('previous').onclick = previous;

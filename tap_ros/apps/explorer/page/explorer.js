@@ -5,6 +5,7 @@
 // The connection, and the steps that lead from a scene to an arm that moves.
 
 const RECONNECT_MS = 1000;
+const SEARCH_MS = 4000;  // that the tracker may take for a goal picture
 const LONG = 70;  // letters of an event that need a wide place
 const STEPS = ['scene', 'objects', 'goal', 'predict', 'go'];
 const VIEW = {scene: 'camera', objects: 'camera', goal: 'goal', predict: 'goal', go: 'subgoal'};  // which a step begins with
@@ -13,13 +14,15 @@ let socket = null;
 let events = [];  // what happened
 let waiting = -1;  // for an answer: how many events there were before it
 let step = '';  // that is to be done
+let sought = 0;  // until when objects are looked for in the goal picture, ms
 
 function connect() {
   socket = new WebSocket(
     `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/socket${location.search}`);
   socket.binaryType = 'arraybuffer';
   socket.onclose = () => {
-    showRun('no connection: does the explorer still run? Trying again', 'bad');
+    showRun('no connection: see the terminal of the explorer', 'bad');
+    document.body.classList.add('off');
     if (state) showState();
     setTimeout(connect, RECONNECT_MS);
   };
@@ -30,6 +33,17 @@ function connect() {
 }
 
 const untracked = () => !state.tracker && !state.camera.objects.length;  // nobody tells where objects are
+/* Whether the tracker still searches the goal picture: it tells of each object, found or not. */
+function searching() {
+  const known = state.goal.objects.map(({name}) => name);
+  if (!(state.tracker && state.goal.pictured && missingGoals().some((name) => !known.includes(name)))) sought = 0;
+  else if (!sought) {
+    sought = Date.now() + SEARCH_MS;
+    setTimeout(() => showState(), SEARCH_MS + 10);
+  }
+  return Date.now() < sought;
+}
+
 const objectCount = (count) => `${count} ${count === 1 ? 'object' : 'objects'}`;
 const connected = () => socket.readyState === WebSocket.OPEN;
 
@@ -58,8 +72,13 @@ function take(message) {
   }
 }
 
-function send(command) {
+/* Takes back what was said of the last try: somebody goes on. */
+function calm() {
   $('error').textContent = '';
+}
+
+function send(command) {
+  calm();
   if (!connected()) {
     showError('There is no connection; a goal in progress goes on until its end.');
     return;
@@ -90,7 +109,7 @@ function progress() {
   const goal_why = goal.pictured ? '' : 'needs a goal picture: step 3';
   const place_why = missing.length ? `needs the goal of ${missing.join(', ')}: step 3` : '';
   const predict_why = camera_why || goal_why || place_why || (!state.predictor && 'needs the predictor, which does not run');
-  const go_why = !state.plans ? `nothing plans how to grasp: for ${state.task} subgoals are predicted only`
+  const go_why = !state.plans ? `the planner cannot grasp: for ${state.task} only subgoals are predicted`
     : camera_why || (!count && 'needs objects: step 2') || place_why
     || (!state.planner && 'needs the planner, which does not run');
   const known = !simulator || Boolean(state.task);  // what scene it is
@@ -103,10 +122,12 @@ function progress() {
       : camera.objects_note ? `${tracker ? 'the tracker' : 'what tells their places'} ${camera.objects_note}` : unsure.length ? `not sure of ${unsure.join(', ')}` : `${objectCount(count)} known`, camera_why],
     goal: [count > 0 && !missing.length, !goal.pictured && !goal.objects.length
       ? `waits for a goal: ${simulator ? 'start a scene' : `photograph it${count ? ', or drag the objects' : ''}`}`
-      : count && missing.length ? `drag to ${missing.length > 1 ? 'their goals' : 'its goal'}: ${missing.join(', ')}` : goal.pictured ? 'the picture is there' : 'placed by hand',
+      : count && missing.length ? searching() ? `looking for ${missing.join(', ')}`
+        : `drag ${missing.join(', ')} to ${missing.length > 1 ? 'their goals' : 'its goal'}` : goal.pictured ? 'the picture is there' : 'placed by hand',
     camera_why],
-    predict: [pictures.subgoal && !state.passed, pictures.subgoal ? state.passed ? 'of an earlier picture' : state.subgoal : predict_why || 'can be predicted now', predict_why],
-    go: [run.reached, run.running ? run.stage : run.end || go_why || 'the arm can go now', go_why]};
+    predict: [pictures.subgoal && !state.passed, pictures.subgoal && !state.passed ? state.subgoal
+      : predict_why || (pictures.subgoal ? 'the subgoal is of an earlier picture' : 'can be predicted now'), predict_why],
+    go: [run.reached, run.running ? run.stage : go_why || run.end || 'the arm can go now', go_why]};
 }
 
 function showState() {
@@ -114,7 +135,9 @@ function showState() {
   if (on && run.running) showRun(run.stage.split(', plan')[0] || 'starting', 'busy');
   else if (on) showRun(done.scene[2] || (state.planner ? 'the arm stands still' : 'no planner runs'), done.scene[2] || !state.planner ? '' : 'good');
   document.body.classList.toggle('running', on && run.running);
-  lead(run.running || run.end ? 'go' : STEPS.find((one) => !done[one][0] && done[one][1]) ?? 'go', run.running || run.end);
+  document.body.classList.toggle('off', !on);
+  const moves = !anew && (run.running || run.end);
+  lead(moves ? 'go' : STEPS.find((one) => !done[one][0] && done[one][1]) ?? 'go', moves);
   for (const one of STEPS) {
     const item = $(`step-${one}`);
     item.classList.toggle('done', Boolean(done[one][0]));
@@ -145,7 +168,7 @@ function showState() {
   $('propose').hidden = $('follow').hidden = !selecting();
   $('again').hidden = !state.tracker || (selecting() && !anew);
   $('again').textContent = anew ? 'keep the old objects' : 'choose other objects';
-  $('follow').textContent = clicks.length ? `use ${clicks.length > 1 ? 'these' : 'this'} ${objectCount(clicks.length)}` : 'use these objects';
+  $('follow').textContent = clicks.length === 1 ? 'use this object' : `use these ${clicks.length || ''} objects`.replace('  ', ' ');
   $('view-observer').parentElement.hidden = !state.observer;
   listObjects();
   const [wrong, waits] = ['wrong', 'waits'].map((how) => state.nodes.filter((one) => one.state === how).length);
@@ -185,13 +208,15 @@ function hint() {
       : state.simulator || state.goal.pictured ? 'Click the middle of each object that is to be moved.'
         : 'Photograph the objects where they are to be, put them back, then click the middle of each.';
   }
-  const missing = missingGoals(), moves = movable();
-  const searched = missing.every((name) => state.goal.objects.some((one) => one.name === name));
+  const missing = missingGoals(), moves = movable(), undecided = state.subgoal.startsWith('undecided');
   return {
-    camera: untracked() ? 'Start tracker_node to click on objects here.' : `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
-    goal: moves && missing.length ? `${searched ? 'Not found in this picture' : 'No goal known yet for'}: ${missing.join(', ')}. Drag each to its place here.`
+    camera: untracked() ? 'Start tracker_node to click on objects here.'
+      : state.run.reached && moves ? `Reached. Drag ${state.movable === 'goal' ? 'goals in the goal picture' : 'objects'} elsewhere and go again, or choose another scene or other objects.` : `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
+    goal: missing.length && searching() ? `Looking for ${missing.join(', ')} in this picture.`
+      : moves && missing.length ? `${missing.some((name) => state.goal.objects.some((one) => one.name === name)) ? 'Not found in this picture' : 'No goal known yet for'}: ${missing.join(', ')}. Drag each to its place here.`
       : `What the table is to look like.${moves ? ' Drag an object to change that.' : ''}`,
-    subgoal: 'The predicted picture in between' + (state.camera.objects.length ? ': each object glows where it is expected then.' : '.'),
+    subgoal: undecided ? `The predictor is ${state.subgoal}: that glows at several places. Go directly, or drag its goal nearer.`
+      : 'The predicted picture in between' + (state.camera.objects.length ? ': each object glows where it is expected then.' : '.'),
     plan: 'Paths of the fingertips that the planner considered; bold: the chosen one.',
     observer: "The camera's view, with the whole arm."}[view];
 }
@@ -201,7 +226,7 @@ function showEvents() {
   fill($('log'), [...events].reverse(), ({text, time, picture, problem}) => made('li', {className: picture && text.length < LONG ? '' : 'wide', title: text},
     ...picture ? [made('img', {src: picture, alt: ''})] : [],
     made('time', {textContent: new Date(1000 * time).toLocaleTimeString()}),
-    made('div', {className: problem ? 'bad' : '', textContent: text})));
+    made('div', {className: problem ? 'bad' : '', textContent: text, tabIndex: -1})));
   $('log').scrollLeft = 0;
 }
 
@@ -238,7 +263,9 @@ on('predict', {do: 'predict'});
 on('direct', {do: 'reach', mode: 'direct'});
 on('subgoal-run', {do: 'reach', mode: 'subgoal'});
 on('cancel', {do: 'cancel'});
-for (const one of STEPS) $(`step-${one}`).querySelector('button').addEventListener('click', () => open(one));
+for (const one of STEPS) {
+  $(`step-${one}`).addEventListener('click', (event) => { if (!event.target.closest('.row')) open(one); });
+}
 document.addEventListener('keydown', (event) => {
   if (event.key !== 'Escape' || !state) return;
   if (drag) {

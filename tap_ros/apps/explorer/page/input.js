@@ -51,11 +51,13 @@ function listObjects() {
   listed = selecting();
   fill($('clicks'), listed ? clicks : state.camera.objects, (one, k) => made('li', {}, ...listed ? [mark(COLOURS[k % 4]),
     made('input', {value: one.name, maxLength: 40, ariaLabel: `name of object ${k + 1}`,
-      oninput: (event) => { one.name = event.target.value.trim(); }}),
+      oninput: (event) => { one.name = event.target.value.trim(); draw(); }}),
     Object.assign(button('✕', () => {
       clicks.splice(k, 1);
+      calm();
       showClicks();
-    }), {title: 'leave this one out', ariaLabel: `not ${one.name}`})]
+      $('large').focus();
+    }), {title: 'leave this one out', ariaLabel: `leave out ${one.name}`})]
     : [mark(colourOf(one.name)), one.name, ...one.state ? [': ', mark(STATE_COLOURS[one.state]), `${one.state}, ${Math.round(100 * one.confidence)}%`] : []]));
 }
 
@@ -70,6 +72,7 @@ function addClick({u, v, outline}) {
 // Pointer and keys
 
 function press(at) {
+  calm();
   if (view === 'camera' && selecting()) {
     addClick(at);
   } else if (movable()) {

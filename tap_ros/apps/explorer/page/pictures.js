@@ -56,7 +56,7 @@ function look(kind) {
 
 for (const [kind, [name, why]] of Object.entries(VIEWS)) {
   $('views').append(made('label', {},
-    made('input', {type: 'radio', name: 'view', id: `view-${kind}`, checked: kind === view, onchange: () => look(kind)}),
+    made('input', {type: 'radio', name: 'view', id: `view-${kind}`, checked: kind === view, onchange: () => { calm(); look(kind); }}),
     made('canvas', {id: `small-${kind}`, width: SMALL, height: SMALL, hidden: true}), made('small', {ariaHidden: 'true'}, why), name));
 }
 
