@@ -153,6 +153,9 @@ check_place() {
 case $1 in
   check) check_place ;;
   wheels) make_wheels ;;
-  build) build_packages ;;
+  build)
+    build_packages
+    echo "[$who] done; to work in it: . scripts/environment.bash"
+    ;;
   *) sed -n '5,10s/^# \{0,1\}//p' "$0"; exit 2 ;;
 esac

@@ -47,7 +47,7 @@ BAGS = {'random': 100_000, 'goal': 0}  # of pushes; the first seed
 METHODS = (*UNTRAINED, *PLANNED)
 FILMED = ('subgoal', 'places')  # the first that is there beside direct
 LEARNED = ('fixed time', 'subgoal')  # of which each seed trains all networks anew
-RESULTS = Path(__file__).parents[2] / 'docs' / 'results'
+RESULTS = Path(__file__).resolve().parents[2] / 'docs' / 'results'
 MARKED, MOVED = 12, 1.0  # demonstrations; px, beyond which an object has begun to move
 AT, RESTS, JOLT = 0.06, 0.005, 0.025  # m: by the way; in a period of rest; as the hand leaves
 # At the usual learning rate it came to believe that nothing ever moves.
@@ -80,7 +80,8 @@ class Options:
     :param scenes: of each task; those are left out whose goal the script of the environment's
         authors does not bring about.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
-    :param runs: folder of the trainings and of the scenes that were run.
+    :param runs: folder of the trainings and of the scenes that were run, which are not run again;
+        other settings need another one.
     :param out: folder for worlds_loop.json, .md and .png; of OGBench worlds_loop_ogbench.json.
     :param results_only: run no more scenes.
     """

@@ -112,6 +112,9 @@ def run(args: Options) -> None:
             faint = f', but hardly in the picture: {mass:.0%} of it' if mass < FAINT else ''
             doubt = ', the mean: no single place is expected' * bool(undecided)
             print(f'  {name} at {u:.1f},{v:.1f}{doubt}{faint}')
+    if any(subgoal.undecided.any() for subgoal in subgoals):
+        print('note: an object without a single place is where these weights cannot decide; they '
+              'may know other scenes only than these pictures')
     write_atomically(args.out, labelled(parts, places, subgoals))
     print(f'written: {escaped(args.out)}')
     if not names:

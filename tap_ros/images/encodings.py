@@ -130,8 +130,8 @@ def decompress(data: bytes | memoryview | np.ndarray, description: str,
             return np.array(picture)
     except UnidentifiedImageError:
         raise ImageError(
-            f"format '{escaped(description, 40)}' cannot be used, or its data are damaged; valid "
-            'are JPEG, PNG, WebP, AVIF and JPEG 2000') from None
+            f"no picture, or a damaged one: '{escaped(description, 40)}'; valid are JPEG, PNG, "
+            'WebP, AVIF and JPEG 2000') from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ImageError(f'damaged compressed picture: {escaped(error, 80)}') from error
 

@@ -41,6 +41,7 @@ PACE = 0.9  # of the limits is used by proposals, so that the search can still a
 VERTICAL = 0.06  # m, a change of height beyond which the arm does not move sideways meanwhile
 TURNS = 0.2, 0.8  # rad, from the way to the goal to that of a push; where it begins out of reach
 DOWN = LOW + 0.02  # m; a gripper that is not lifted and higher than this stands upon something
+UP = LIFTED - 0.03  # m; one that is higher than this is lifted
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,15 @@ class Limits:
                 ('low', tuple(map(max, self.low, WORKSPACE_LOW))),
                 ('high', tuple(map(min, self.high, WORKSPACE_HIGH)))):
             object.__setattr__(self, name, value)
+
+    def end(self, here: np.ndarray, move: np.ndarray) -> np.ndarray:
+        """
+        Return where a move ends, which leads not out of the workspace and no farther out.
+
+        :param here: (..., 2) m, where it begins; move: (..., 2) m.
+        """
+        return np.asarray((here + move).clip(np.minimum(self.low, here),
+                                             np.maximum(self.high, here)))
 
 
 FULL = Limits()
@@ -103,7 +113,7 @@ class SequenceShape:
         Neither low nor lifted, it stands upon something: then it must go up before it can push.
         Where it takes several periods to come down, it passes these heights every time.
         """
-        return int(self.climb_limit >= LIFTED - LOW and DOWN < height < LIFTED - 0.03)
+        return int(self.climb_limit >= LIFTED - LOW and DOWN < height < UP)
 
     def climbs(self, lifted: np.ndarray, phase: np.ndarray,
                height: float) -> tuple[np.ndarray, np.ndarray]:
@@ -143,10 +153,9 @@ class SequenceShape:
         actions[..., :2] *= np.where(low, slow, 1)[..., None]
         here = np.broadcast_to(gripper[:2], actions[:, 0, :2].shape)
         for move in actions[..., :2].swapaxes(0, 1):
-            wanted = here + move
-            here = wanted.clip(np.minimum(self.limits.low, here),
-                               np.maximum(self.limits.high, here))
-            move += here - wanted
+            end = self.limits.end(here, move)
+            move += end - (here + move)
+            here = end
         return actions
 
     def rise(self, gripper: np.ndarray) -> np.ndarray:

@@ -68,14 +68,15 @@ class PlanCost:
         :param landings: (N, 2) metres, NaN for none; objects: (K, 2).
         :param blocked: (B, 2), where the gripper met something; dearer than any push gains.
         :param limits: of the arm: where its workspace ends.
-        :return: (N,) pixels: 0, or 100 (1000 where blocked) and 10 for every centimetre that is
-            missing; the latter alone within LEG of the clearance, and where the workspace ends:
-            nothing is farther there, so narrow places are tried.
+        :return: (N,) pixels: 0, or 100 (1000 where blocked or out of the workspace) and 10 for
+            every centimetre that is missing; the latter alone within LEG of the clearance, and
+            where the workspace ends: nothing is farther there, so narrow places are tried.
         """
-        costs = np.zeros(len(landings))
+        low, high = np.array(limits.low), np.array(limits.high)
+        out, edge = (((landings < low + margin) | (landings > high - margin)).any(1)
+                     for margin in (-1e-3, EDGE))
+        costs = np.where(out, 1000.0, 0.0)
         if self.clearance:
-            low, high = np.array(limits.low) + EDGE, np.array(limits.high) - EDGE
-            edge = ((landings < low) | (landings > high)).any(1)
             for places, near, least, room in (
                     (objects, np.where(edge, BLOCKED, self.clearance), 100, self.clearance + LEG),
                     (blocked, BLOCKED, 1000, BLOCKED)):

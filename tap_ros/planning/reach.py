@@ -20,9 +20,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from tap_ros.base.contract import GOAL_TOLERANCE, LOST, step_budget, UNSURE
+from tap_ros.base.contract import GOAL_TOLERANCE, HIDDEN, LOST, step_budget, UNSURE
 from tap_ros.base.text import listing
-from tap_ros.planning.action_sequences import DOWN, FULL, Limits
+from tap_ros.planning.action_sequences import DOWN, FULL, Limits, UP
 from tap_ros.planning.hierarchy import Itinerary, Target
 from tap_ros.planning.visual_mpc import Goal, Memory, Plan, Scene, VisualMPC
 
@@ -234,11 +234,12 @@ class Reach:
         return bool((seen.gripper - self._from)[:3] @ told < MOVED * (told @ told))
 
     def _is_held(self) -> bool:
-        """Return whether the last move through the air went less than half as far as told."""
+        """Return whether the last move, lifted, went less than half as far as told."""
         if self._answered is None:
             return False
         told, way = self._answered.plan.action[:2], (self._stood - self._from)[:2]
-        return bool(told @ told > HELD ** 2 and self._stood[2] > DOWN
+        least = min(HELD, self._config.limits.move / 2)
+        return bool(told @ told > least ** 2 and min(self._from[2], self._stood[2]) > UP
                     and way @ told < 0.5 * told @ told)
 
     def interrupted(self, seen: Observation | None) -> End | None:
@@ -340,14 +341,19 @@ class Reach:
         self._next = state
         self.pixels = pixels = seen.pixels
         self.distance = itinerary.targets[-1].distance(pixels)
-        if self.distance <= config.reached and UNSURE not in seen.states:
-            return End('reached', 'reached')
+        hidden = [name for name, state in zip(seen.names, seen.states) if state == HIDDEN]
+        guess = f'; the place of {listing(hidden)}, hidden, is a guess' if hidden else ''
+        close = self.distance <= config.reached and UNSURE not in seen.states
+        if close and not (hidden and seen.gripper[2] < UP):
+            return End('reached', f'reached{guess}')
         if self.steps >= self._budget:
             held = self._held + self._is_held()
-            return End('spent', f'stopped, as the step budget of {self._budget} is spent' + (
-                f'; {held} moves through the air went less than half as far as told: the arm may '
-                'not reach that far, limit its workspace' if held >= MOST_HELD else ''))
-        if UNSURE in seen.states:  # nothing is pushed by a place that is not believed
+            short = (f'; {held} moves through the air went less than half as far as told: the arm '
+                     'may not reach that far, limit its workspace') if held >= MOST_HELD else ''
+            return End(
+                'spent', f'stopped, as the step budget of {self._budget} is spent{guess}{short}')
+        # Nothing is pushed by a place that is not believed, nothing ends by one that is not seen.
+        if close or UNSURE in seen.states:
             plan = self._mpc.aside(seen.gripper, self.distance, state.memory, config.limits)
             self._next = replace(state, memory=plan.memory)
             return Command(plan, len(state.switches), seen)

@@ -143,7 +143,7 @@ def test_compressed_pictures_that_cannot_be_used_are_refused_with_the_reason():
     _, colour = cv2.imencode('.png', np.full((8, 8, 3), 40000, np.uint16))
     for data, form, words in (
             (packed(SCENE, 'JPEG')[:400], 'jpeg', 'damaged compressed picture'),
-            (b'no picture', 'jpeg', "format 'jpeg' cannot be used, or its data are dam"),
+            (b'no picture', 'jpeg', "no picture, or a damaged one: 'jpeg'; valid are JPEG"),
             (packed(deep, 'PNG'), '16UC1; png compressed', 'more than 8 bits a channel'),
             (colour.tobytes(), 'rgb16; png compressed', 'more than 8 bits a channel'),
             (packed(deep, 'PNG'), '16UC1; compressedDepth png', 'record the colour camera'),

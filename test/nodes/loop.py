@@ -33,7 +33,8 @@ import yaml
 
 SEED = 1_000_003
 CONFIG = yaml.safe_load((Path(__file__).parents[2] / 'config' / 'tap_ros.yaml').read_text())
-USUAL = CONFIG['/**/visual_mpc_node']['ros__parameters']
+USUAL = CONFIG['/**/visual_mpc_node']['ros__parameters'] | {
+    'x_min': -0.45, 'x_max': 0.45, 'y_min': -0.45, 'y_max': 0.45}
 
 
 class Loop:

@@ -16,6 +16,7 @@ from tap_ros.planning.action_sequences import FULL, SequenceShape, SIZE
 from tap_ros.ros.observations import Observations
 from tap_ros.ros.topics import STREAM, to_stamp
 
+HERE = np.array([0.1, -0.2, 0.05, 0], np.float32)  # the gripper, m
 ACTION = np.array([0.03, -0.01, 0.02, 1], np.float32)  # m in a control period, gripper
 
 
@@ -33,7 +34,7 @@ def commanded(request):
 
         def send(action):
             stamp = to_stamp(next(stamps))
-            assert arm.send(goal, action, stamp, ())
+            assert arm.send(goal, action, HERE, stamp, ())
             linear = twists.wait(10, lambda m: m.header.stamp == stamp).twist.linear
             return np.array([linear.x, linear.y, linear.z])
 
@@ -60,6 +61,17 @@ def test_no_action_is_faster_than_the_limits_whatever_the_control_period(command
         assert (np.abs(sent) * period <= np.array(ACTION_LIMIT) + 1e-9).all()
     planned = SequenceShape(step_limits(params)).clip(np.full((1, SIZE), 1e30))
     np.testing.assert_allclose(planned[0, 0] / period, sent[0], err_msg='the planner knows it')
+
+
+def test_no_command_leads_out_of_the_workspace_as_it_is_now(commanded):
+    period, params, send = commanded
+    params._node.set_parameters([Parameter('x_max', value=float(HERE[0]) + 0.004),
+                                 Parameter('y_max', value=-0.3)])  # it stands outside
+    moved = period * send(ACTION * (1, -1, 1, 1))
+    out = period * send(ACTION * (-1, 1, 1, 1))
+    limit = step_limits(params).move
+    np.testing.assert_allclose(moved[:2], [0.004, 0], atol=1e-6)
+    np.testing.assert_allclose(out[:2], [-min(0.03, limit), -min(0.01, limit)], atol=1e-6)
 
 
 def test_the_workspace_is_by_default_the_reach_of_the_arm_and_within_the_contracts():

@@ -46,7 +46,8 @@ def test_the_file_has_every_parameter_with_its_default_and_reaches_the_nodes(tmp
     assert set(NODES) == set(NODE_CLASSES)
     for name, written in NODES.items():
         values = declared(name)
-        for own in ('topics', *MOUNT):  # all that are known; the place of the simulated arm
+        # All that are known; where the simulated arm stands, and how far it reaches.
+        for own in ('topics', *MOUNT, 'x_min', 'x_max', 'y_min', 'y_max'):
             values.pop(own, None)
         if name == 'visual_mpc_node':  # neither more than the arm does, nor less
             assert (values['max_step_xy'], values['max_step_z']) == (MOVE_LIMIT, CLIMB_LIMIT)

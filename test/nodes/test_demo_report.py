@@ -214,7 +214,8 @@ def test_no_moment_is_lost_while_the_demo_is_held_up():
 def test_real_nodes_push_tracked_objects_of_two_tasks_with_one_start(tmp_path, capsys):
     assert command.run(command.Options(
         scenes=1, tasks=('push2', 'order2'), step_budget=2, out=str(tmp_path / 'demo'))) == 0
-    ends = re.findall(r'(\w+) 2000000 .* in 2 steps .* in 2 steps', capsys.readouterr().out)
+    ends = re.findall(r'(\w+) 2000000 .* in 2 steps, \w+ .* in 2 steps, \w+\n',
+                      capsys.readouterr().out)
     assert ends == ['push2', 'order2']
     assert {path.name for path in (tmp_path / 'demo').iterdir()} == {
         'logs', 'recording', 'push2.webp', 'order2.webp', 'report.html', 'scenes.json'}

@@ -72,6 +72,13 @@ def test_what_is_out_of_reach_is_pushed_from_another_side():
     assert (np.abs(places[:, 0]) > 0.08).sum() > 4
 
 
+def test_proposals_begin_within_the_workspace():
+    shape = SequenceShape(Limits(low=(-0.05, -0.3)))
+    proposals = push_proposals(shape, np.array([0, 0, LIFTED, 0]), np.array([[0.05, 0.0]]),
+                               np.array([[0.3, 0.0]]), 40, np.random.default_rng(0))
+    assert (SHAPE.actions(shape.clip(proposals), np.zeros(4))[..., 0].cumsum(1) > -0.0501).all()
+
+
 @pytest.mark.parametrize('limit', [0.02, 0.09, 0.15])
 def test_replanning_with_small_limits_the_gripper_comes_down(limit):
     shape, gripper = SequenceShape(Limits(climb=limit)), np.array([0, 0, LIFTED, 0])

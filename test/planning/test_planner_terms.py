@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from tap_ros.base.contract import LIFTED, LOW
-from tap_ros.planning.action_sequences import FULL, HORIZON
+from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
 from tap_ros.planning.cost import (
     distances_to_all_pixels,
     distances_to_pixels,
@@ -149,6 +149,10 @@ def test_narrow_places_are_tried_only_where_the_workspace_ends():
         ends, np.array([[0.0, 0.0], [0.0, 0.36]]), np.array([[0.2, -0.45]]))
     assert costs[0] > 1000 and costs[3] > 100 and costs[6] > 100
     assert 0 < costs[2] < 100 and 0 < costs[5] < 100 and not costs[[1, 4]].any()
+    # In a smaller workspace other places are at its end, and those beyond it are none.
+    costs = PlanCost(clearance=0.1).of_landings(
+        ends, np.array([[0.0, 0.0], [0.0, 0.36]]), np.zeros((0, 2)), Limits(high=(0.25, 0.09)))
+    assert 0 < costs[3] < 100 and costs[[1, 2, 5, 6]].min() >= 1000 and not costs[[0, 4]].any()
 
 
 def sticks(actions, grippers):

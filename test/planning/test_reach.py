@@ -270,6 +270,19 @@ def test_what_is_unsure_is_not_there_and_begins_no_goal(mpc):
     assert isinstance(Reach(mpc, ReachConfig(10)).step(look(0, states=('unsure', 'seen'))), Wait)
 
 
+def test_what_is_hidden_at_its_goal_is_looked_at_from_above_before_the_end(mpc):
+    low, lifted = (np.array([0, 0, z, 0], np.float32) for z in (LOW, LIFTED))
+    guessed = {'pixels': GOAL.pixels, 'states': ('seen', 'hidden')}
+    for after, outcome, words in (({'pixels': GOAL.pixels}, 'reached', 'reached'), (
+            guessed, 'reached', 'reached; the place of b, hidden, is a guess'), ({}, None, None)):
+        reach = begun(mpc)
+        answer = reach.step(look(0, gripper=low, **guessed))
+        np.testing.assert_allclose(answer.plan.action, [0, 0, LIFTED - LOW, 0], atol=1e-6)
+        reach.sent()
+        end = reach.step(look(1, gripper=lifted, **after))
+        assert (getattr(end, 'outcome', None), getattr(end, 'message', None)) == (outcome, words)
+
+
 def test_each_command_is_planned_from_what_the_one_before_left(mpc):
     reach, goal, memory = begun(mpc, seed=5), mpc.goal(GOAL.pixels), Memory(5)
     for t in range(3):

@@ -36,7 +36,14 @@ from tap_ros.apps.demo.report import (
 )
 from tap_ros.apps.demo.watch import click, FOLLOWED_NO_MORE, Refused, right_order, Watch
 from tap_ros.apps.node_processes import errors_in, NodeProcesses
-from tap_ros.base.contract import DEFAULT_LOOK, LOOKS, ROBOT_MASKS, step_budget, TABLE
+from tap_ros.base.contract import (
+    DEFAULT_LOOK,
+    LOOKS,
+    ROBOT_MASKS,
+    step_budget,
+    SUCCESS_DISTANCE,
+    TABLE,
+)
 from tap_ros.base.errors import ConfigError, TapError
 from tap_ros.base.files import free_folder, write_atomically, write_rows
 from tap_ros.base.options import Folder, one_of
@@ -58,9 +65,12 @@ PATIENT = {'image_timeout': 300.0, 'max_age': 300.0, 'max_silence': 60.0,
            'predictor_timeout': CALL_S}
 SOURCES = {  # by whether objects are tracked
     True: 'Objects are tracked from a click on each in the first picture (here its true pixel) '
-          'and found in the goal picture; the ground truth of the simulator only measures '
-          'distances and draws numbers and arrows.',
+          'and found in the goal picture; one that is not found there is clicked there, too. For '
+          'the rest the ground truth of the simulator only measures distances and draws numbers '
+          'and arrows.',
     False: 'Object pixels at every step, and the distances, are ground truth of the simulator.'}
+SUCCESS = (f'A scene succeeds if every object ends within {100 * SUCCESS_DISTANCE:.0f} cm of its '
+           'goal.')
 MOST_SHOWN = 10  # of the errors in logs
 REPEATS = ('All runs are in lock-step: the same seeds end the same on a busy machine, only the '
            'seconds differ. Another processor can differ in the last digits of a plan.')
@@ -126,8 +136,10 @@ class Options:
 
     def check(self) -> None:
         """Raise ConfigError for what cannot be run."""
-        if self.scenes < 1 or self.step_budget < 0:
-            raise ConfigError('scenes must be at least 1, and step-budget 0 or more')
+        if self.scenes < 1:
+            raise ConfigError(f'scenes {self.scenes}: expected 1 or more')
+        if self.step_budget < 0:
+            raise ConfigError(f'step-budget {self.step_budget}: expected 0 or more')
         if self.world != TABLE and not self.tasks:
             raise ConfigError(f'world {self.world}: name its tasks, as --tasks push-v3')
         if len(set(self.tasks)) < len(self.tasks):
@@ -162,7 +174,7 @@ def run(args: Options) -> int:
             folder / 'report.html', scenes, films,
             f'{len(scenes)} of {len(args.plan)} scenes, from seed {args.seed} on, which are in no '
             f'recording, training or table. Left out, as they could not be finished: {reasons}. '
-            f'{SOURCES[args.tracked]} {REPEATS}', {
+            f'{SUCCESS} {SOURCES[args.tracked]} {REPEATS}', {
                 'date': time.strftime('%Y-%m-%d %H:%M'),
                 'time': f'{time.monotonic() - begin:.0f} s',
                 'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
@@ -177,7 +189,8 @@ def run(args: Options) -> int:
         if gains_clearly(scene):
             filmed.add(task)
         print(f'  {task} {seed}   ' + '   '.join(
-            f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps'
+            f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps, '
+            + ('success' if run.reached else 'failed')
             for mode, name in MODES.items() for run in [scene.runs[mode]]), flush=True)
         write_page()  # whatever ends the demo, what was done is there
     wrong = [f'{log}: {line}' for log in sorted((folder / 'logs').rglob('*.log'))
@@ -191,6 +204,8 @@ def run(args: Options) -> int:
             print(f'film       {folder / scene.task}.webp')
         write_page()
         print(f'\n{results_table(summary(scenes))}\n')
+        print(f'success    every object within {100 * SUCCESS_DISTANCE:.0f} cm of its goal at '
+              'the end; cm are means over objects')
         print(f'recording  {folder / "recording"}')
         print(f'page       {folder / "report.html"}')
     print(f'time       {time.monotonic() - begin:.0f} s')

@@ -131,10 +131,9 @@ class ExplorerCalls:
     @property
     def stage(self) -> str:
         """What the goal in progress is doing."""
-        if self._cancelled:
-            return 'cancelling'
-        return self._client.silence('visual_mpc_node') or self._stage or (
-            'ending' if self._ours else "another client's goal" if not self._asked else '')
+        return self._client.silence('visual_mpc_node') or (
+            'cancelling' if self._cancelled else self._stage or (
+                'ending' if self._ours else "another client's goal"))
 
     def forget_end(self, said: str = '', reached: bool = False, spent: bool = False) -> None:
         """Forget how the last goal ended: there is another one, or it ended in another way."""
@@ -176,10 +175,15 @@ class ExplorerCalls:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _on_status(self, message: GoalStatusArray) -> None:
-        self._under_way = any(one.status in UNDER_WAY for one in message.status_list)
+        with self._lock:
+            self._under_way = any(one.status in UNDER_WAY for one in message.status_list)
+            self._forget_goal()
+        self._planner = publishers_present(self._node, STATUS) if self._under_way else None
+
+    def _forget_goal(self) -> None:
+        """Forget whose goal it was once none is in progress."""
         if not (self._under_way or self._asked):
             self._ours = self._cancelled = False
-        self._planner = publishers_present(self._node, STATUS) if self._under_way else None
 
     # In the threads of the pool
 
@@ -187,6 +191,8 @@ class ExplorerCalls:
         try:
             getattr(self, f'_{do}')(**fields)
         except Exception as error:
+            if do == 'cancel':
+                self._cancelled = False
             if isinstance(error, TapError) or not self._ending:  # else it is being taken down
                 text = escaped(reason(self._node, do, error), 1000)
                 said = f'{REFUSED[do]}: {plain(text)}'
@@ -201,6 +207,7 @@ class ExplorerCalls:
             if do == 'reach':
                 with self._lock:
                     self._asked, self._goal, self._stage = False, None, ''
+                    self._forget_goal()
 
     def _call(self, service: str, **fields: Any) -> Any:
         return self._client.call(service, give_up=lambda: self._ending, **fields)

@@ -4,6 +4,7 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
+import socket
 import time
 from typing import Annotated
 
@@ -13,6 +14,7 @@ from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import free_folder
 from tap_ros.base.options import Folder, one_of
 from tap_ros.base.plugins import names
+from tap_ros.base.text import escaped
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 
@@ -49,8 +51,11 @@ def run(args: Options) -> None:
     :raises ConfigError: for a port or seed that there is not.
     :raises NodeEnded: when a node ends; the message has the end of its log.
     """
-    if not 0 <= args.port < 2**16 or args.seed < 0:
-        raise ConfigError('port: expected 0 to 65535; seed: 0 or more')
+    if not 0 <= args.port < 2**16:
+        raise ConfigError(f'port {args.port}: expected 0 to 65535')
+    if args.seed < 0:
+        raise ConfigError(f'seed {args.seed}: expected 0 or more')
+    check_address(args.host, args.port)  # before nodes start that would disturb those of another
     folder = free_folder(args.logs)
     with NodeProcesses(folder) as processes:
         start_nodes(processes, args)
@@ -61,6 +66,17 @@ def run(args: Options) -> None:
             while True:
                 time.sleep(0.2)
                 processes.check()
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise ConfigError where nothing can listen, as where another explorer does."""
+    try:
+        family, *_ = socket.getaddrinfo(host, port)[0]
+        socket.create_server((host, port), family=family).close()
+    except OSError as error:
+        raise ConfigError(
+            f'cannot listen at {escaped(host, 100)}:{port}: {error.strerror or error}; end the '
+            'other explorer, or give this one its own --port and ROS_DOMAIN_ID') from error
 
 
 def start_nodes(processes: NodeProcesses, args: Options) -> None:

@@ -86,7 +86,8 @@ function draw() {
   }
   // The main button is what comes next: to accept, to mark (as Enter does), or the next demonstration.
   const offer = added(), named = names().length > 0;
-  const free = offer.length || !(named ? draft.includes(null) || !draft.length : !draft.length) ? -1 : Math.max(0, draft.indexOf(null));
+  const wanted = named ? names().length : Object.values(state.marks)[0]?.length || 1;
+  const free = offer.length || given().length >= wanted ? -1 : Math.max(0, draft.indexOf(null));
   fill($('names'), named ? names() : ['this moment'], (name, k) => Object.assign(
     button(` ${name}${named ? ` (${k + 1})` : ''}`, () => mark(named ? k : null)), {className: k === free ? 'main' : ''}));
   [...$('names').children].forEach((one, k) => one.prepend(  // of one width, so that nothing moves
@@ -272,7 +273,7 @@ document.addEventListener('keydown', (event) => {
 document.addEventListener('click', (event) => { if (event.detail) document.activeElement.blur(); });  // of a pointer
 $('slider').oninput = () => go(Number($('slider').value));
 $('now').onclick = () => mark();
-$('now').onerror = () => say(SILENT);
+$('now').onerror = () => say('This picture could not be loaded: does mark still run?');
 $('now').onload = () => $('now').classList.toggle('small', $('now').naturalWidth < 200);
 $('next').onclick = next;
 $('previous').onclick = previous;

@@ -87,14 +87,15 @@ class ArmCommander:
                 self._goal = None
             self._stop()
 
-    def send(self, goal: object, action: np.ndarray, stamp: Time,
+    def send(self, goal: object, action: np.ndarray, gripper: np.ndarray, stamp: Time,
              topics: Collection[str], ages: bool = True) -> bool:
         """
-        Send one command, clipped to the limits.
+        Send one command, clipped to the limits and to the workspace.
 
         :param goal: as given to begin.
         :param action: (4,) metres moved in one control period, and gripper opening 0..1. What is
             sent is the velocity, m/s.
+        :param gripper: (4,) where it was seen last, m.
         :param stamp: builtin_interfaces/Time of the image that it answers.
         :param topics: sensors that the arm depends on until the next command.
         :param ages: whether what they tell gets old; not where time waits for commands.
@@ -111,6 +112,8 @@ class ArmCommander:
         limits = step_limits(params)
         limit = np.array([limits.move, limits.move, limits.climb])
         move = np.clip(np.asarray(action[:3], np.float64), -limit, limit)
+        here = np.asarray(gripper[:2], np.float64)
+        move[:2] += limits.end(here, move[:2]) - (here + move[:2])
         message = TwistStamped()
         message.header.stamp = (self._node.get_clock().now().to_msg()
                                 if params['stamp_with_now'] else stamp)

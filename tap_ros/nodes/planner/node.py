@@ -328,8 +328,8 @@ class VisualMpcNode(LifecycleBase):
                 throttle_duration_sec=10.0)
             return False
         return not self._goal.changed(accepted) and self._arm.send(
-            handle, command.plan.action, to_stamp(answers.stamp_ns), self._inputs.topics,
-            ages=answers.received < math.inf)
+            handle, command.plan.action, seen.gripper, to_stamp(answers.stamp_ns),
+            self._inputs.topics, ages=answers.received < math.inf)
 
     def _publish_progress(self, handle: ServerGoalHandle, reach: Reach, command: Command) -> None:
         """Publish feedback, the plan and the distance after a command."""

@@ -4,7 +4,6 @@
 
 import cv2
 import numpy as np
-from tap_ros.base.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.images.drawing import draw_crosses, enlarge
 from tap_ros.planning.forward_model import ForwardModelConfig
 from tap_ros.planning.table import project
@@ -79,10 +78,6 @@ def way(actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
 
     :param actions: (N, 4) m per control period.
     :param gripper: (4,), where they begin.
-    :return: (N + 1, 3) m, within the workspace.
+    :return: (N + 1, 3) m.
     """
-    points = np.empty((len(actions) + 1, 3))
-    points[0] = gripper[:3]
-    for step, move in enumerate(np.asarray(actions, float)[:, :3]):
-        points[step + 1] = np.clip(points[step] + move, WORKSPACE_LOW, WORKSPACE_HIGH)
-    return points
+    return np.asarray(np.concatenate([gripper[None, :3], actions[:, :3]]).cumsum(0, dtype=float))

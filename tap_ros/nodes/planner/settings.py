@@ -52,8 +52,8 @@ class PlannerParameters:
     :param max_step_z: Largest |dz| of a command in metres, 0.6 m/s at most; the planner
         knows it, from the next goal on.
     :param x_min: Where the fingertips may go, m in the frame world, least x. Commands do not lead
-        farther; the planner knows it, from the next goal on. By default the arm's own reach at its
-        usual mount, likewise x_max, y_min and y_max.
+        farther, at once; the planner knows it from the next goal on. By default the arm's own
+        reach from its usual mount, as are x_max, y_min and y_max.
     :param x_max: Greatest x, m.
     :param y_min: Least y, m.
     :param y_max: Greatest y, m.

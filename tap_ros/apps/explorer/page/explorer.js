@@ -213,7 +213,7 @@ function hint() {
     camera: untracked() ? 'Start tracker_node to click on objects here.'
       : state.run.reached && moves ? `Reached. Drag ${state.movable === 'goal' ? 'goals in the goal picture' : 'objects'} elsewhere and go again, or choose another scene or other objects.` : `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
     goal: missing.length && searching() ? `Looking for ${missing.join(', ')} in this picture.`
-      : moves && missing.length ? `${missing.some((name) => state.goal.objects.some((one) => one.name === name)) ? 'Not found in this picture' : 'No goal known yet for'}: ${missing.join(', ')}. Drag each to its place here.`
+      : moves && missing.length ? `${missing.every((name) => state.goal.objects.some((one) => one.name === name)) ? 'Not found in this picture' : 'No goal known yet for'}: ${missing.join(', ')}. Drag each to its place here.`
       : `What the table is to look like.${moves ? ' Drag an object to change that.' : ''}`,
     subgoal: undecided ? `The predictor is ${state.subgoal}: that glows at several places. Go directly, or drag its goal nearer.`
       : 'The predicted picture in between' + (state.camera.objects.length ? ': each object glows where it is expected then.' : '.'),
@@ -264,7 +264,7 @@ on('direct', {do: 'reach', mode: 'direct'});
 on('subgoal-run', {do: 'reach', mode: 'subgoal'});
 on('cancel', {do: 'cancel'});
 for (const one of STEPS) {
-  $(`step-${one}`).addEventListener('click', (event) => { if (!event.target.closest('.row')) open(one); });
+  $(`step-${one}`).addEventListener('click', ({target}) => { if (state && target.isConnected && !target.closest('.row')) open(one); });
 }
 document.addEventListener('keydown', (event) => {
   if (event.key !== 'Escape' || !state) return;

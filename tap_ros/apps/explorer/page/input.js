@@ -56,7 +56,7 @@ function listObjects() {
       clicks.splice(k, 1);
       calm();
       showClicks();
-      $('large').focus();
+      $('large').focus({preventScroll: true});
     }), {title: 'leave this one out', ariaLabel: `leave out ${one.name}`})]
     : [mark(colourOf(one.name)), one.name, ...one.state ? [': ', mark(STATE_COLOURS[one.state]), `${one.state}, ${Math.round(100 * one.confidence)}%`] : []]));
 }
