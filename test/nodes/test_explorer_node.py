@@ -207,6 +207,10 @@ def test_a_goal_of_another_client_is_seen_and_can_be_cancelled(explored):
     explored.loop.reset()
     with explored.page() as (ask, told):
         assert not told()['run']['running']
+        ask({'do': 'reach', 'mode': 'direct'})  # one of ours before, which is cancelled
+        told(lambda now: 'step' in now['run']['stage'])
+        ask({'do': 'cancel'})
+        told(lambda now: not now['run']['running'])
         reaching = explored.loop.begin(mode='direct', step_budget=1000)
         assert 'another client' in told(lambda now: now['run']['running'])['run']['stage']
         predictor = explored.loop.processes['predictor_node']
