@@ -62,7 +62,7 @@ def test_compressed_pictures_are_read_and_a_bad_one_costs_itself(tmp_path):
     messages = [compressed(t, bad[t // 5] if t % 5 == 3 else scene(t)) for t in range(1, 16)]
     (episode,), (text, *more) = read(record(tmp_path / 'bad', messages))
     assert len(episode) == 12 and f'{TOPIC}: 1 message cannot be used: damaged' in text
-    assert "format 'rgb8; jpeg compressed bgr8' cannot be used, or" in more[0]
+    assert "no picture, or a damaged one: 'rgb8; jpeg compressed bgr8'" in more[0]
     (episode,), _ = read(tmp_path / 'bad', reading=Reading(rate=0.5))
     assert (episode.stamps // SECOND).tolist() == [1, 4, 5, 7, 9, 11, 14, 15]  # the next good one
 

@@ -125,7 +125,7 @@ def test_damage_is_named_with_its_record_and_the_rest_is_read(tmp_path, capsys):
     for number, (data, words, lengths) in enumerate((
             (good + good[:-1], 'record 1 of a.tfrecord: it is cut off', [6]),
             (wrong + good, 'record 0 of a.tfrecord: it is damaged', [6]),
-            (record(spoiled), "picture 3 of record 0 of a.tfrecord: format 'unknown'", [5]),
+            (record(spoiled), 'picture 3 of record 0 of a.tfrecord: no picture', [5]),
             (wrong, 'its CRC does not match', []), (b'x' * 20, 'no uncompressed TFRecord', []),
             (record({'steps/reward': [1.0]}), 'there are none', []))):
         file.write_bytes(data)
