@@ -310,6 +310,7 @@ def last_legs(rows):
 def summarise(rows):
     """Return a line for each task and method: shares and distances with 95% intervals."""
     found = []
+    rows = sorted(rows, key=lambda row: METHODS.index(row['method']))
     for (task, method), same in pd.DataFrame(rows).groupby(['task', 'method'], sort=False):
         scenes = same.groupby('seed', sort=False)
         line = {'task': task.rpartition('/')[2], 'method': method, 'scenes': scenes.ngroups,
