@@ -60,14 +60,15 @@ class Limits:
                 ('high', tuple(map(min, self.high, WORKSPACE_HIGH)))):
             object.__setattr__(self, name, value)
 
-    def end(self, here: np.ndarray, move: np.ndarray) -> np.ndarray:
+    def shorten(self, move: np.ndarray, here: np.ndarray) -> np.ndarray:
         """
-        Return where a move ends, which leads not out of the workspace and no farther out.
+        Return as much of a move as leads not out of the workspace, and no farther out.
 
-        :param here: (..., 2) m, where it begins; move: (..., 2) m.
+        :param move: (..., 2) m; here: (..., 2) m, where it begins.
         """
-        return np.asarray((here + move).clip(np.minimum(self.low, here),
-                                             np.maximum(self.high, here)))
+        wanted = here + move
+        end = wanted.clip(np.minimum(self.low, here), np.maximum(self.high, here))
+        return np.asarray(move + (end - wanted))
 
 
 FULL = Limits()
@@ -153,9 +154,8 @@ class SequenceShape:
         actions[..., :2] *= np.where(low, slow, 1)[..., None]
         here = np.broadcast_to(gripper[:2], actions[:, 0, :2].shape)
         for move in actions[..., :2].swapaxes(0, 1):
-            end = self.limits.end(here, move)
-            move += end - (here + move)
-            here = end
+            move[:] = self.limits.shorten(move, here)
+            here = here + move
         return actions
 
     def rise(self, gripper: np.ndarray) -> np.ndarray:

@@ -341,7 +341,7 @@ class Reach:
         self._next = state
         self.pixels = pixels = seen.pixels
         self.distance = itinerary.targets[-1].distance(pixels)
-        hidden = [name for name, state in zip(seen.names, seen.states) if state == HIDDEN]
+        hidden = [name for name, known in zip(seen.names, seen.states) if known == HIDDEN]
         guess = f'; the place of {listing(hidden)}, hidden, is a guess' if hidden else ''
         close = self.distance <= config.reached and UNSURE not in seen.states
         if close and not (hidden and seen.gripper[2] < UP):

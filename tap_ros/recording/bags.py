@@ -37,8 +37,7 @@ def find_bags(paths: Paths) -> list[Bag]:
     """
     Find recordings.
 
-    :param paths: one or several .mcap files, bag folders, or folders of bag folders; a Bag
-        stays.
+    :param paths: one or several .mcap files, bag folders, or folders of bag folders; a Bag stays.
     :return: list of Bag, in the order of the paths, those of a folder by the numbers in their
         names. No file is opened yet.
     :raises RecordingError: where there is none; it says what is there instead.

@@ -15,6 +15,7 @@ from processes import Client, LocalNode, Newest, until
 import pytest
 from sensor_msgs.msg import CompressedImage, Image
 from tap_msgs.msg import ObjectStates
+from tap_ros.apps.explorer import command as explore
 from tap_ros.apps.explorer.browser_commands import CommandError, parse_command
 from tap_ros.apps.explorer.display import GoalByHand
 from tap_ros.apps.explorer.node import ExplorerNode
@@ -178,6 +179,16 @@ RESET = {'do': 'reset', 'task': 'push2', 'seed': 7}
 MOVE = {'do': 'move', 'name': 'object_0', 'u': 3, 'v': 4.5}
 CUP = {'name': 'cup', 'u': 3, 'v': 4.5}
 SELECT = {'do': 'select', 'objects': [CUP, {**CUP, 'name': 'ring'}]}
+
+
+def test_beside_another_explorer_no_node_is_started(tmp_path):
+    with socket.create_server(('127.0.0.1', 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(ConfigError, match=f'127.0.0.1:{port}.*another port.*ROS_DOMAIN_ID'):
+            explore.run(explore.Options(port=port, logs=str(tmp_path / 'logs')))
+    with pytest.raises(ConfigError, match='99999'):
+        explore.run(explore.Options(port=99999, logs=str(tmp_path / 'logs')))
+    assert not (tmp_path / 'logs').exists()
 
 
 def test_a_command_reads_as_it_is_meant_and_what_makes_no_sense_is_refused_by_the_fields_name():

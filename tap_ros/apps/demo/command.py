@@ -204,8 +204,7 @@ def run(args: Options) -> int:
             print(f'film       {folder / scene.task}.webp')
         write_page()
         print(f'\n{results_table(summary(scenes))}\n')
-        print(f'success    every object within {100 * SUCCESS_DISTANCE:.0f} cm of its goal at '
-              'the end; cm are means over objects')
+        print(f'{SUCCESS} Numbers of cm are means over objects.')
         print(f'recording  {folder / "recording"}')
         print(f'page       {folder / "report.html"}')
     print(f'time       {time.monotonic() - begin:.0f} s')

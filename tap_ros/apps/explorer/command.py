@@ -4,17 +4,16 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
-import socket
 import time
 from typing import Annotated
 
 from tap_ros.apps.node_processes import NodeProcesses
+from tap_ros.apps.server import PageServer
 from tap_ros.base.contract import DEFAULT_LOOK, LOOKS
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import free_folder
 from tap_ros.base.options import Folder, one_of
 from tap_ros.base.plugins import names
-from tap_ros.base.text import escaped
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 
@@ -48,14 +47,16 @@ def run(args: Options) -> None:
     """
     Start the nodes, say where the page is, and wait for Ctrl-C.
 
-    :raises ConfigError: for a port or seed that there is not.
+    :raises ConfigError: for a seed that there is not, and where the page cannot be served.
     :raises NodeEnded: when a node ends; the message has the end of its log.
     """
-    if not 0 <= args.port < 2**16:
-        raise ConfigError(f'port {args.port}: expected 0 to 65535')
     if args.seed < 0:
         raise ConfigError(f'seed {args.seed}: expected 0 or more')
-    check_address(args.host, args.port)  # before nodes start that would disturb those of another
+    try:  # before nodes start, which would disturb those of another explorer
+        PageServer('explorer/page', args.host, args.port).server_close()
+    except ConfigError as error:
+        raise ConfigError(
+            f'{error}; beside another explorer with its own ROS_DOMAIN_ID, too') from error
     folder = free_folder(args.logs)
     with NodeProcesses(folder) as processes:
         start_nodes(processes, args)
@@ -66,17 +67,6 @@ def run(args: Options) -> None:
             while True:
                 time.sleep(0.2)
                 processes.check()
-
-
-def check_address(host: str, port: int) -> None:
-    """Raise ConfigError where nothing can listen, as where another explorer does."""
-    try:
-        family, *_ = socket.getaddrinfo(host, port)[0]
-        socket.create_server((host, port), family=family).close()
-    except OSError as error:
-        raise ConfigError(
-            f'cannot listen at {escaped(host, 100)}:{port}: {error.strerror or error}; end the '
-            'other explorer, or give this one its own --port and ROS_DOMAIN_ID') from error
 
 
 def start_nodes(processes: NodeProcesses, args: Options) -> None:

@@ -36,9 +36,9 @@ def renamed(text: str, names: Mapping[str, str]) -> str:
 
 def clicks_named(text: str, objects: Iterable[Mapping[str, Any]]) -> str:
     """Return what the tracker says of clicks, each called as its object, and what helps here."""
-    for one in objects:
-        at = tuple(round(float(one[axis]), 1) for axis in 'uv')
-        text = text.replace(f'click {at}', one['name'])
+    text = renamed(text, {
+        f'click {tuple(round(float(one[axis]), 1) for axis in "uv")}': one['name']
+        for one in objects})
     return text.replace('; click on an object', '; leave it out (✕), or click on an object')
 
 

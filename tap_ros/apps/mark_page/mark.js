@@ -92,7 +92,6 @@ function draw() {
     button(` ${name}${named ? ` (${k + 1})` : ''}`, () => mark(named ? k : null)), {className: k === free ? 'main' : ''}));
   [...$('names').children].forEach((one, k) => one.prepend(  // of one width, so that nothing moves
     made('span', {}, (named ? draft[k] === frame : draft.includes(frame)) ? 'undo' : 'mark')));
-  $('accept').className = 'main';
   $('next').className = free < 0 && !offer.length ? 'main' : '';
   $('previous').disabled = !seen.length;
   $('accept').hidden = !offer.length;
