@@ -52,7 +52,7 @@ class Options:
     seed: int = 0
     namespace: str = ''
     timeout: float = 20.0
-    out: File = 'subgoal.png'
+    out: File = 'prediction.png'
 
 
 def run(args: Options) -> None:

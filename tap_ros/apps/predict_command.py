@@ -68,7 +68,7 @@ class Options:
     samples: int = 1
     recursion: int = 1
     seed: int = 0
-    out: File = 'subgoal.png'
+    out: File = 'prediction.png'
 
 
 def run(args: Options) -> None:
@@ -109,17 +109,18 @@ def run(args: Options) -> None:
         for name, where, mass, undecided in zip(
                 names, subgoal.expected_pixels, subgoal.mass, subgoal.undecided):
             u, v = (where + 0.5) * extent / subgoal.image.shape[1::-1] - 0.5 + (left, top)
-            faint = f', but hardly in the picture: {mass:.0%} of it' if mass < FAINT else ''
-            doubt = ', the mean: no single place is expected' * bool(undecided)
-            print(f'  {name} at {u:.1f},{v:.1f}{doubt}{faint}')
+            notes = ['the mean of several likely places'] * bool(undecided)
+            if mass < FAINT:
+                notes.append(f'only {mass:.0%} of the object is in the prediction')
+            print(f'  {name} at {u:.1f},{v:.1f}' + f' ({"; ".join(notes)})' * bool(notes))
     if any(subgoal.undecided.any() for subgoal in subgoals):
-        print('note: an object without a single place is where these weights cannot decide; they '
-              'may know other scenes only than these pictures')
+        print('note: these weights do not decide between several places; they may not know scenes '
+              'like these pictures')
     write_atomically(args.out, labelled(parts, places, subgoals))
     print(f'written: {escaped(args.out)}')
     if not names:
-        print('note: whether all objects are in the prediction is checked with --objects only; '
-              'look at the picture')
+        print('note: without --objects it is not checked whether all objects are in the '
+              'prediction and whether the weights know such scenes; look at the picture')
 
 
 def read_inputs(files: Mapping[str, str], positions: Mapping[str, Sequence[str]],

@@ -15,6 +15,7 @@ from PIL import Image
 from tap_ros.apps.demo.film import Scene
 from tap_ros.base.files import write_atomically
 from tap_ros.evaluation.intervals import Interval, mean_interval
+from tap_ros.training.split import FEW
 
 MODES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
 
@@ -33,7 +34,7 @@ class Row(NamedTuple):
         """Return the cells of a table."""
         share = [f'{100 * n / self.scenes:.0f}%' for n in self.reached]
         nearer, more = '{:+.1f} ({:+.1f} to {:+.1f})', '{:+.0f} ({:+.0f} to {:+.0f})'
-        if self.scenes == 1:  # has no interval
+        if self.scenes < FEW:  # their interval says nothing
             nearer, more = '{:+.1f}', '{:+.0f}'
         return [self.label, str(self.scenes), *(f'{cm:.1f}' for cm in self.cm),
                 nearer.format(*self.nearer), *share, more.format(*self.more)]
@@ -68,9 +69,11 @@ def in_words(row: Row) -> str:
     if row.scenes == 1:
         return (f'One scene, which proves nothing: objects end {row.nearer.value:.1f} cm nearer '
                 'to their goals via the predicted subgoal.')
-    return (f'Via the predicted subgoal {via} of {row.scenes} scenes succeed, directly {direct}; '
-            f'objects end on average {row.nearer.value:.1f} cm nearer to their goals '
-            f'(95% interval {row.nearer.low:.1f} to {row.nearer.high:.1f}){chance}.')
+    told = (f'Via the predicted subgoal {via} of {row.scenes} scenes succeed, directly {direct}; '
+            f'objects end on average {row.nearer.value:.1f} cm nearer to their goals')
+    if row.scenes < FEW:
+        return f'{told}. So few scenes prove nothing.'
+    return f'{told} (95% interval {row.nearer.low:.1f} to {row.nearer.high:.1f}){chance}.'
 
 
 def results_table(rows: Sequence[Row]) -> str:
