@@ -33,10 +33,10 @@ COPYING: dict[str, Any] = {'keyframes': True, 'new_pixels': False}
 # A folder: the name in the table, and settings beside those of `foreign`.
 WAYS: dict[str, tuple[str, dict[str, Any]]] = {
     'two': ('two pictures, new pixels', {}),
-    'three': ('three pictures, copying', COPYING),
+    'keyframes': ('keyframes, copying', COPYING),
     # 2.25 times the pixels: as many steps less.
-    'three_96px': ('three pictures of 96 px, equal time', COPYING | {'size': 96, 'steps': 355})}
-DRAWN = 'two', 'three'  # of them, in pictures
+    'keyframes_96px': ('keyframes, 96 px, equal time', COPYING | {'size': 96, 'steps': 355})}
+DRAWN = 'two', 'keyframes'  # of them, in pictures
 QUALITY = 65  # of these, as JPEG
 COLUMNS = 5  # pairs of an answer and the true frame, in the picture of all
 
@@ -106,7 +106,7 @@ def sheets(options: Options, truth: dict[str, dict[str, float]]) -> tuple[np.nda
     Draw held-out demonstrations at the camera's resolution.
 
     :return: of the first draw rows of start, goal, what each predictor shows, and the frame of the
-        moment; of all draws, side by side, what that of three pictures shows, and that frame.
+        moment; of all draws, side by side, what that with keyframes shows, and that frame.
     """
     first, pairs = list[list[np.ndarray]](), list[np.ndarray]()
     for draw in range(options.draws):

@@ -41,7 +41,7 @@ from tap_ros.recording.reading import Reading
 from tap_ros.training.labels import film, fit, moments_of
 from tap_ros.training.marks import chance
 
-Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'three pictures']
+Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'keyframes']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
          'metaworld/window-open-v3', 'metaworld/drawer-open-v3',
          'metaworld/button-press-topdown-v3', 'ogbench/button', 'ogbench/cube', 'ogbench/drawer',
@@ -260,22 +260,22 @@ def page(rows):
 
 def compare(rows):
     """
-    Compare three pictures with two, over the tasks with several trainings of both.
+    Compare predictors with keyframes with those without, over the tasks with several trainings of both.
 
     :return: dict: tasks, how many; hit and near, in words the mean difference in points with its
         interval over the tasks, whose demonstrations and marks both had; alone, by hit and near
         those of the tasks that differ by themselves. There intervals are by Newcombe's
         square-and-add, as if the two had not seen the same demonstrations.
     """
-    two, three = ({row['task']: row for row in rows
+    without, shown = ({row['task']: row for row in rows
                    if row['method'] == method and row.get('seeds', 0) > 1}
                   for method in WITH_MARKS)
-    tasks = [task for task in three if task in two]
+    tasks = [task for task in shown if task in without]
     if not tasks:
         return {}
     found, alone = {'tasks': len(tasks)}, {}
     for name in ('hit', 'near'):
-        gains = [_less(three[task][name], two[task][name]) for task in tasks]
+        gains = [_less(shown[task][name], without[task][name]) for task in tasks]
         found[name] = _in_points(mean_interval([gain.value for gain in gains]))
         alone[name] = [f'{task.rpartition("/")[2]} {_in_points(gain)}'
                   for task, gain in zip(tasks, gains) if gain.low > 0 or gain.high < 0]

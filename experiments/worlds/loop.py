@@ -59,7 +59,7 @@ PREDICTOR = {'progress_margin': 0.0, 'start_crop': 0.0, 'initial_weights': 'push
              'colour': False, 'brightness': 0.0, 'goal_picture': 'recorded', 'robot_mask': 'all',
              'fill_context': 1.0, 'batch_size': 8, 'device': 'cpu', 'threads': 1,
              'save_every': 250}
-# Beside the wall the object is far from where start and goal show it: a third picture has it.
+# Beside the wall the object is far from where start and goal show it: keyframes have it.
 COPIED = {'selection': 'marks', 'keyframes': True, 'new_pixels': False, 'initial_weights': '',
           'fill_context': 0.5}
 

@@ -20,9 +20,9 @@ METHODS = {
     'progress': {'selection': 'progress', 'progress_margin': 0.5, 'steps': 400},
     'still': {'selection': 'still', 'steps': 400},
     'marks': {'selection': 'marks'},
-    'three pictures': {'selection': 'marks', 'keyframes': True, 'new_pixels': False},
+    'keyframes': {'selection': 'marks', 'keyframes': True, 'new_pixels': False},
 }
-WITH_MARKS = 'marks', 'three pictures'
+WITH_MARKS = 'marks', 'keyframes'
 SETTINGS = {'recipe': 'foreign', 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
 CUTS = {'ogbench/cube': '24,20,96'}  # --crop, px of 128: where hand and cube move
 

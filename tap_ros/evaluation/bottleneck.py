@@ -68,21 +68,23 @@ def context_pixels(episode: Episode, goal_picture: str) -> np.ndarray:
 
 
 def known_maps(pixels: np.ndarray, prediction: Prediction, bank: KeyframeBank | None,
-               alike: int = 0) -> torch.Tensor:
+               alike: np.ndarray | None = None) -> torch.Tensor:
     """
     Return one-hot maps (1, C, K, H, W) of the objects in the pictures that are copied from.
 
     :param pixels: float32 (2, K, 2), of context_pixels; a forward prediction uses the start only.
-    :param bank: that the third picture is from, of demonstration `alike`; None: there is none.
+    :param bank: that other pictures are from, of demonstrations `alike` (n,); None: there is none.
     """
     flow = prediction.flow
     maps = one_hot_maps(
         torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device), flow.shape[-2:])[None]
-    return maps if bank is None else bank.beside_maps(maps, pixels[:1], np.array([alike]))
+    return maps if bank is None or alike is None else bank.beside_maps(
+        maps, pixels[:1], alike[None])
 
 
 def predicted_maps(pixels: np.ndarray, prediction: Prediction, b: int,
-                   bank: KeyframeBank | None = None, alike: int = 0) -> WarpedMaps:
+                   bank: KeyframeBank | None = None,
+                   alike: np.ndarray | None = None) -> WarpedMaps:
     """
     Warp one-hot maps of the objects as a prediction warps its context pictures.
 

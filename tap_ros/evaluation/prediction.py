@@ -200,9 +200,9 @@ def ask(network: PredictorNetwork | Predictor, batch: Batch,
     prediction = network(to_float(batch.context).to(device), z)
     if (bank := getattr(network, 'bank', None)) is None:
         return prediction.image, lambda b, pixels: predicted_maps(pixels, prediction, b)
-    alike, _ = bank.find(batch.context.cpu().numpy())
+    alike, _ = bank.find(batch.context.cpu().numpy(), network.config.num_keyframes)
     return prediction.image, lambda b, pixels: predicted_maps(
-        pixels, prediction, b, bank, int(alike[b]))
+        pixels, prediction, b, bank, alike[b])
 
 
 def draw_latents(episodes: Iterable[int], count: int, size: int) -> torch.Tensor:

@@ -71,9 +71,10 @@ def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: It
             spread = (prediction.image.std(0, correction=0) / 2).mean().item()
             pixels, placed = context_pixels(store[i], goal_picture), np.nan
             if prediction.new_pixels is None and pixels.size and np.isfinite(pixels).all():
-                bank, alike = network.bank, 0
+                bank, alike = network.bank, None
                 if bank is not None:
-                    alike = int(bank.find(batch.context.cpu().numpy())[0][0])
+                    (alike,), _ = bank.find(
+                        batch.context.cpu().numpy(), network.config.num_keyframes)
                 maps = known_maps(pixels, prediction, bank, alike).expand(count, -1, -1, -1, -1)
                 at = expected_pixels(warp_object_maps(  # samples, K, 2
                     maps, prediction.flow, prediction.masks).maps)

@@ -3,11 +3,11 @@
 """
 A bank of keyframes: what demonstrations showed at the bottleneck, to be copied from.
 
-A network for three pictures is given start, goal, and the keyframe of the demonstration whose
-start and goal are most alike, as no hand at the object is in the first two; not in the paper. With
-recursion each level has a keyframe of its own. The bank is part of the weights file: of each
-demonstration small pictures of start and goal, keyframes as PNGs, and where its objects are in
-them, where the recordings tell.
+A network for more than two pictures is given start, goal, and keyframes of the demonstrations
+whose start and goal are most alike, as no hand at the object is in the first two; not in the
+paper. With recursion each level has keyframes of its own. The bank is part of the weights file:
+of each demonstration small pictures of start and goal, keyframes as PNGs, and where its objects
+are in them, where the recordings tell.
 """
 
 from collections.abc import Callable
@@ -27,6 +27,7 @@ from tap_ros.prediction.retrieval import (
     LARGEST_WEIGHT,
     nearest_others,
     places_then,
+    repeated,
     SIDE,
     spread_out,
     unlike,
@@ -157,35 +158,36 @@ class KeyframeBank:
                 for picture in self.keyframes])
         return self._scaled[size]
 
-    def find(self, pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def find(self, pictures: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """
         Find the most alike demonstrations, see retrieval.nearest_others.
 
         :param pictures: uint8 (B, 2, H, W, 3), start and goal as the network is given them.
-        :return: indices int64 (B,) by the weights, and distances (B,) of the nearest by equal
-            weights, which tell what is unlike everywhere.
+        :param count: of demonstrations; where there are fewer, the last one is repeated.
+        :return: indices int64 (B, count) by the weights, the nearest first, and distances (B,) of
+            the nearest by equal weights, which tell what is unlike everywhere.
         """
         asked = np.stack([ends_of(*pair) for pair in pictures])
-        indices, _ = nearest_others(asked, self._ends, 1, self._weights)
+        indices, _ = nearest_others(asked, self._ends, count, self._weights)
         _, distances = nearest_others(asked, self._ends, 1)
-        return indices[:, 0], distances[:, 0]
+        return repeated(indices, count), distances[:, 0]
 
     def unlike(self, distance: float) -> str:
         """Say that start and goal are unlike those of all demonstrations; '': they are not."""
         return unlike(distance, self._usual)
 
-    def completed(self, context: torch.Tensor) -> torch.Tensor:
-        """Return contexts (B, 2, 3, H, W) in [-1, 1] with the keyframe as the third picture."""
-        return self.beside(context, self.find(to_uint8(context))[0])
+    def completed(self, context: torch.Tensor, count: int) -> torch.Tensor:
+        """Return contexts (B, 2, 3, H, W) in [-1, 1] with count keyframes each behind them."""
+        return self.beside(context, self.find(to_uint8(context), count)[0])
 
     def numbers(self, indices: np.ndarray, level: int = 1) -> np.ndarray:
-        """Return which keyframes demonstrations (B,) have at a level, from 1; or at the last."""
+        """Return which keyframes demonstrations have at a level, from 1; or at the last."""
         return indices * self.levels + min(level, self.levels) - 1
 
     def beside(self, context: torch.Tensor, indices: np.ndarray, level: int = 1) -> torch.Tensor:
-        """Return contexts (B, 2, 3, H, W) with keyframes of demonstrations (B,) as thirds."""
+        """Return contexts (B, 2, 3, H, W) with keyframes of demonstrations (B, n) behind them."""
         keyframes = self.scaled(tuple(context.shape[-2:]))[self.numbers(indices, level)]
-        return torch.cat([context, to_float(keyframes).to(context.device)[:, None]], 1)
+        return torch.cat([context, to_float(keyframes).to(context.device)], 1)
 
     def beside_maps(self, maps: torch.Tensor, asked: np.ndarray, indices: np.ndarray,
                     level: int = 1) -> torch.Tensor:
@@ -194,14 +196,14 @@ class KeyframeBank:
 
         :param maps: (B, 2, K, H, W), in start and goal.
         :param asked: (B, K, 2), (u, v) in the start; see retrieval.places_then.
-        :param indices: demonstrations (B,).
-        :return: (B, 3, K, H, W); the same as given where nothing is known.
+        :param indices: demonstrations (B, n).
+        :return: (B, 2 + n, K, H, W); the same as given where nothing is known.
         """
         if self._objects is None:
             return maps
         places = torch.from_numpy(np.stack([
-            places_then(known[0], known[min(level, self.levels)], pixels)
-            for pixels, known in zip(asked, self._objects[indices])]))
-        third = one_hot_maps(places.nan_to_num(), maps.shape[-2:])
-        third *= places.isfinite().all(-1)[..., None, None]
-        return torch.cat([maps, third.to(maps.device)[:, None]], 1)
+            [places_then(known[0], known[min(level, self.levels)], pixels) for known in each]
+            for pixels, each in zip(asked, self._objects[indices])]))
+        more = one_hot_maps(places.nan_to_num(), maps.shape[-2:])
+        more *= places.isfinite().all(-1)[..., None, None]
+        return torch.cat([maps, more.to(maps.device)], 1)

@@ -30,8 +30,8 @@ class PredictorConfig:
     :param image_size: pixels on each side, a power of two or three times one, from 16 on; the
         paper has 64.
     :param base_width: channels of the first block; they double at each following one. Paper: 32.
-    :param num_context: pictures that the prediction is conditioned on: 2 is start and goal, 3 adds
-        the keyframe of the most alike demonstration, see keyframe_bank.
+    :param num_context: pictures that the prediction is conditioned on: 2 is start and goal; more
+        add keyframes of the most alike demonstrations, see keyframe_bank.
     :param code_size: length of the vector between encoder and decoders.
     :param latent_size: length of z, appended to that vector; 0 is a deterministic predictor.
     :param new_pixels: whether there is a decoder for pixels that cannot be copied. Object maps
@@ -67,6 +67,11 @@ class PredictorConfig:
         if self.image_size * self.base_width > 2 ** 15:
             raise ConfigError(f'image_size times base_width: expected at most {2 ** 15}, got '
                               f'{self.image_size} times {self.base_width}')
+
+    @property
+    def num_keyframes(self) -> int:
+        """Pictures beside start and goal."""
+        return max(0, self.num_context - 2)
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -225,7 +230,7 @@ class PredictorNetwork(nn.Module):
     the same shape give the new pixels, the flow and the masks (appendix C, its last figure), or
     one gives all of them (`decoder='shared'`).
 
-    :ivar bank: what the third picture of a network for three comes from, unless it is given.
+    :ivar bank: what pictures beside start and goal come from, unless they are given.
     """
 
     bank: KeyframeBank | None = None
@@ -262,13 +267,13 @@ class PredictorNetwork(nn.Module):
         """
         Predict.
 
-        :param context: (B, C, 3, H, W) in [-1, 1]; of a network with a bank also without the
-            third picture, which then is looked up.
+        :param context: (B, C, 3, H, W) in [-1, 1]; of a network with a bank also start and goal
+            alone, whose keyframes then are looked up.
         :param z: (B, latent_size), or None for zeros, the mean of the prior.
         :return: a Prediction.
         """
         if self.bank is not None and context.shape[1] == 2:
-            context = self.bank.completed(context)
+            context = self.bank.completed(context, self.config.num_keyframes)
         B, C, _, H, W = context.shape
         x, levels = context.flatten(0, 1), []                   # B*C, 3, 64, 64
         for layer in self.encoder:

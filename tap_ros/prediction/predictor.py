@@ -44,13 +44,13 @@ class SubgoalPredictor(Predictor):
         :param network: PredictorNetwork, on the device it shall run on.
         :param training: dict saying how the weights were made.
         :param source: how errors call it, for example the file of its weights.
-        :raises ConfigError: if it takes more than a start and a goal picture, and a keyframe.
+        :raises ConfigError: if it takes more than start and goal, and has no keyframes.
         :raises WeightsError: if it predicts nonsense.
         """
-        if network.config.num_context not in ((1, 2) if network.bank is None else (3,)):
+        if (network.bank is None) == (network.config.num_keyframes > 0):
             raise ConfigError('predictor: needs weights for 2 context pictures, start and goal, '
-                              'for 1, the start, or for 3 with a bank of keyframes; these are for '
-                              f'{network.config.num_context}')
+                              'for 1, the start, or for more with a bank of keyframes; these are '
+                              f'for {network.config.num_context}')
         self.config = network.config
         self.mode = 'forward' if network.config.num_context == 1 else 'bidirectional'
         self.image_size = (network.config.image_size, network.config.image_size)
@@ -123,11 +123,12 @@ class SubgoalPredictor(Predictor):
         sources = [pictures_of(request) for N, request in zip(counts, requests) for _ in range(N)]
         sizes = [answer_size(pictures) for pictures in sources]
         said: list[dict[str, Any]] = [{} for _ in requests]
-        if (bank := self._network.bank) is not None:  # one demonstration for all levels
-            alike, distances = bank.find(np.stack([pictures for pictures, _ in scenes]))
+        if (bank := self._network.bank) is not None:  # the same demonstrations for all levels
+            alike, distances = bank.find(np.stack([pictures for pictures, _ in scenes]),
+                                         self.config.num_keyframes)
             said = [{'distance': distance, 'warning': bank.unlike(distance)}
                     for distance in distances.tolist()]
-            alike = np.repeat(alike, counts)
+            alike = np.repeat(alike, counts, 0)
         places = np.repeat([pixels for _, pixels in scenes], counts, 0)  # rows, C, K, 2
         maps = one_hot_maps(torch.from_numpy(places).to(self._device), self.image_size)
         levels: list[list[list[Subgoal]]] = [[] for _ in requests]
@@ -144,8 +145,8 @@ class SubgoalPredictor(Predictor):
             if bank is not None:
                 shown = bank.beside(context, alike[:rows], level)
                 known = bank.beside_maps(maps, places[:rows, 0], alike[:rows], level)
-                copied = [[*pictures, bank.keyframes[n]] for pictures, n in zip(
-                    copied, bank.numbers(alike, level))]
+                copied = [[*pictures, *(bank.keyframes[n] for n in numbers)]
+                          for pictures, numbers in zip(copied, bank.numbers(alike, level))]
             prediction = self._network(shown, z)
             warped = warp_object_maps(known, prediction.flow, prediction.masks)
             images = enlarged(prediction, copied, sizes)
@@ -177,10 +178,10 @@ def load_network(path: str | Path,
     values, state, training = load_weights(path, 'predictor')
     bank = KeyframeBank.take(state, path)
     network = make_network(PredictorNetwork, PredictorConfig, values, state, path)
-    if (bank is None) == (network.config.num_context == 3):
+    if (bank is None) == (network.config.num_keyframes > 0):
         raise WeightsError(f'{escaped(path)}: weights for {network.config.num_context} pictures '
-                           f'with{"out" * (bank is None)} a bank of keyframes, which those for 3 '
-                           'have; train again')
+                           f'with{"out" * (bank is None)} a bank of keyframes, which those for '
+                           'more than 2 have; train again')
     network.bank = bank
     network.eval().requires_grad_(False)
     return placed(network, device), training

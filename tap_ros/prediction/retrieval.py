@@ -18,6 +18,7 @@ SIDE = 16  # px of a small picture, whose pixels are the means of areas
 LARGEST = 255.0  # distance of white from black
 LARGEST_WEIGHT = 1000
 EQUAL = np.ones((2, SIDE, SIDE), np.int32)  # weights of the plain distance
+COMPARED, UNUSUAL = 5, 1.5  # demonstrations, and factor, see usual_keyframes
 _ROWS = 256  # whose distances from all others are held at once
 _LEARNED_FROM = 128  # demonstrations at most
 _SHRINKAGE = 0.1  # of learned weights towards equal ones
@@ -85,6 +86,11 @@ def nearest_others(asked: np.ndarray, known: np.ndarray, count: int,
     return (np.take_along_axis(indices, columns, 1), np.take_along_axis(distances, columns, 1))
 
 
+def repeated(columns: np.ndarray, count: int) -> np.ndarray:
+    """Return (N, count): columns (N, n) of n at most count, the last one again and again."""
+    return np.pad(columns, ((0, 0), (0, count - columns.shape[1])), 'edge')
+
+
 def neighbours(ends: np.ndarray, count: int,
                weights: np.ndarray = EQUAL) -> tuple[np.ndarray, np.ndarray]:
     """
@@ -126,6 +132,28 @@ def learned_weights(ends: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
         [wanted, np.full(away.shape[1], pull * (sums @ wanted) / (sums @ sums))]))
     whole = np.round(found * (LARGEST_WEIGHT / max(found.max(), 1e-12))).astype(np.int32)
     return whole.reshape(EQUAL.shape) if whole.any() else EQUAL
+
+
+def usual_keyframes(ends: np.ndarray, keyframes: np.ndarray,
+                    weights: np.ndarray = EQUAL) -> np.ndarray:
+    """
+    Say which keyframes look like those of the most alike demonstrations.
+
+    The others are mostly frames of another moment, by a wrong label.
+
+    :param ends: uint8 (N, 2, SIDE, SIDE, 3); weights: as nearest takes them.
+    :param keyframes: uint8 (N, L, H, W, 3).
+    :return: bool (N,), False where they are UNUSUAL times as far from those of the COMPARED most
+        alike, in the median, as is usual; so of most it is True.
+    """
+    if len(ends) < 3:
+        return np.ones(len(ends), bool)
+    near, _ = neighbours(ends, COMPARED, weights)
+    small = np.stack([[_smaller(picture) for picture in each] for each in keyframes])
+    shown = small.reshape(len(ends), -1).astype(np.float32)
+    away = np.median([np.square(shown[near[:, k]] - shown).mean(1)
+                      for k in range(near.shape[1])], 0)
+    return np.asarray(away <= UNUSUAL ** 2 * np.median(away))
 
 
 def _squares(pictures: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:

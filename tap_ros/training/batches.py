@@ -45,8 +45,8 @@ class Batch:
         targets, video and bare are black, and nothing counts; None: True everywhere.
     :param preference: float32 (B, levels, T), w(t) of Eq. 5 for selection marks and still, of each
         level of recursion; else None.
-    :param keyframes: uint8 (B, levels, H, W, 3), the third picture of each level of recursion;
-        None: networks see two.
+    :param keyframes: uint8 (B, levels, n, H, W, 3), pictures beside start and goal of each level
+        of recursion; None: networks see two.
     :param augmentation: of all pictures that networks see; None: they see them as they are.
     """
 
@@ -180,7 +180,7 @@ class Pictures:
     :param frames: where they come from; None: the store.
     :param filled: with a robot mask, where targets and video come from.
     :param preference: of every episode of the store w of its frames, (levels, T).
-    :param keyframes: what the third picture of a training is drawn from.
+    :param keyframes: what pictures beside start and goal are drawn from.
     """
 
     frames: Frames | None = None

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The third picture of a training: labelled frames of the demonstrations that are most alike."""
+"""Pictures beside start and goal: labelled frames of the demonstrations that are most alike."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tap_ros.base.errors import ImageError
 from tap_ros.prediction.keyframe_bank import KeyframeBank, MOST_OBJECTS
-from tap_ros.prediction.retrieval import ends_of, learned_weights, neighbours
+from tap_ros.prediction.retrieval import (
+    ends_of,
+    learned_weights,
+    nearest_others,
+    repeated,
+    usual_keyframes,
+)
 from tap_ros.recording.full_size import FullSize
 import torch
 
@@ -19,17 +25,19 @@ if TYPE_CHECKING:
     from tap_ros.training.frames import FilledStore
     from tap_ros.training.predictor_config import TrainingConfig
 
-NEIGHBOURS = 5  # demonstrations of which one is drawn, so that its picture must be moved
+SHOWN = 3  # demonstrations whose keyframes a network sees
+NEIGHBOURS = 5  # of which they are drawn, so that their pictures must be moved
 
 
 class Keyframes:
     """
-    The labelled frames of each training episode.
+    The labelled frames of each training episode, but for those that are unlike the others.
 
     :param store: the EpisodeStore; episodes: indices of those to train on.
     :param preference: of each episode of the store w (levels, T); the largest ones are the labels.
     :param config: of the training.
     :param filled: the store without the robot: keyframes are as targets are.
+    :ivar left_out: those of the episodes whose labels are not to be trusted.
     """
 
     def __init__(self, store: 'EpisodeStore', episodes: np.ndarray,
@@ -37,21 +45,23 @@ class Keyframes:
                  filled: 'FilledStore | None' = None) -> None:
         self._store, self._episodes, self._config, self._filled = store, episodes, config, filled
         rows = episodes.tolist()
-        self._labels = np.stack([preference[i].argmax(1) for i in rows])  # N, levels
+        labels = np.stack([preference[i].argmax(1) for i in rows])  # N, levels
         given = store if filled is None or not config.fill_context else filled
-        self._ends = np.stack([ends_of(*given.frames(i)[[0, -1]]) for i in rows])
+        ends = np.stack([ends_of(*given.frames(i)[[0, -1]]) for i in rows])
         shown = store if filled is None else filled
-        pictures = np.stack([shown.frames(i)[at] for i, at in zip(rows, self._labels)])
-        self._pictures = torch.from_numpy(pictures)
-        self._weights = learned_weights(self._ends, pictures)
-        self._near = (neighbours(self._ends, NEIGHBOURS, self._weights)[0] if len(episodes) > 1
-                      else np.zeros((1, 1), np.int64))
+        pictures = np.stack([shown.frames(i)[at] for i, at in zip(rows, labels)])
+        kept = usual_keyframes(ends, pictures, learned_weights(ends, pictures))
+        self.left_out = episodes[~kept].tolist()
+        self._kept, self._labels, self._ends = episodes[kept], labels[kept], ends[kept]
+        self._pictures = torch.from_numpy(pictures[kept])
+        self._weights = learned_weights(self._ends, pictures[kept])
+        self._near, _ = nearest_others(ends, self._ends, NEIGHBOURS, self._weights)
 
     def draw(self, chosen: np.ndarray, rng: np.random.Generator) -> torch.Tensor:
-        """Return uint8 (B, levels, H, W, 3), of each episode those of one of the most alike."""
+        """Return uint8 (B, levels, SHOWN, H, W, 3), of some of the most alike, in their order."""
         near = self._near[np.searchsorted(self._episodes, chosen)]
-        return self._pictures[near[np.arange(len(near)), rng.integers(near.shape[1], size=len(
-            near))]]
+        drawn = np.sort(rng.random(near.shape).argsort(1)[:, :SHOWN], 1)
+        return self._pictures[repeated(np.take_along_axis(near, drawn, 1), SHOWN)].transpose(1, 2)
 
     def bank(self) -> KeyframeBank:
         """Return the bank that goes with the weights, of pictures at the recorded size."""
@@ -59,7 +69,7 @@ class Keyframes:
         full = FullSize(self._store, self._config.crop)
 
         def shown(n: int) -> np.ndarray:
-            return full.picture(int(self._episodes[n // levels]), int(self._labels.flat[n]))
+            return full.picture(int(self._kept[n // levels]), int(self._labels.flat[n]))
 
         choose = partial(KeyframeBank.choose, self._ends, objects=self._objects(), levels=levels,
                          weights=self._weights)
@@ -71,7 +81,7 @@ class Keyframes:
     def _objects(self) -> np.ndarray | None:
         """Return where objects are, as KeyframeBank takes it."""
         places = [self._store[i].object_pixels[[0, *at]][:, :MOST_OBJECTS]
-                  for i, at in zip(self._episodes.tolist(), self._labels)]
+                  for i, at in zip(self._kept.tolist(), self._labels)]
         objects = np.full((len(places), len(places[0]), max(one.shape[1] for one in places), 2),
                           np.nan, np.float32)
         for row, one in zip(objects, places):

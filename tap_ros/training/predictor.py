@@ -5,10 +5,12 @@
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
+import sys
 from typing import Any
 
 import numpy as np
 from tap_ros.base.errors import ConfigError
+from tap_ros.base.text import listing
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_float, to_uint8
@@ -19,7 +21,7 @@ from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.augmentation import Augmentation
 from tap_ros.training.batches import Batch, episode_order, make_batch, Pictures, Sampling
 from tap_ros.training.frames import FilledStore, has_room, ResidentFrames
-from tap_ros.training.keyframes import Keyframes
+from tap_ros.training.keyframes import Keyframes, SHOWN
 from tap_ros.training.marks import episode_preferences
 from tap_ros.training.objective import (
     discriminators_loss,
@@ -67,6 +69,7 @@ def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = T
             assert preference is not None, 'marks label the frames'
             keyframes = Keyframes(run.store, run.training, preference, config, filled)
             network.bank = keyframes.bank()
+            _print_left_out(keyframes)
         state = run.begin(network, AVERAGE_DECAY, helpers)
         state.precision = state.precision or pick_precision(config.precision, run.device)
         networks = Networks(state.network, **dict[str, Any](state.helpers.items()),
@@ -113,7 +116,7 @@ def make_networks(run: Run[TrainingConfig],
     vae, longest = config.latent == 'vae', int(run.store.lengths.max())
     shape = PredictorConfig(
         image_size=run.store.image_size[0], base_width=config.base_width,
-        num_context=1 if config.forward else 2 + config.keyframes,
+        num_context=1 if config.forward else 2 + SHOWN * config.keyframes,
         latent_size=LATENT_SIZE if vae else 0, new_pixels=config.new_pixels,
         decoder=config.decoder, skips=config.skips)
     network, helpers = PredictorNetwork(shape), dict[str, torch.nn.Module]()
@@ -155,6 +158,14 @@ def draw_batch(store: EpisodeStore, episodes: np.ndarray, config: TrainingConfig
         batch = replace(batch, keyframes=pictures.keyframes.draw(chosen, rng))
     return replace(batch, augmentation=Augmentation.draw(
         len(chosen), config.colour, config.brightness, rng))
+
+
+def _print_left_out(keyframes: Keyframes) -> None:
+    """Print before a training whose labelled frames are not shown as keyframes; on stderr."""
+    if left_out := [str(i) for i in keyframes.left_out]:
+        print(f'keyframes: those of demonstrations {listing(left_out, 10)} are left out, they are '
+              'unlike those of similar demonstrations; where a label is wrong, mark that one',
+              file=sys.stderr)
 
 
 def _values(outcome: Outcome, batch: Batch) -> dict[str, torch.Tensor]:

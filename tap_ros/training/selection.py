@@ -54,22 +54,23 @@ class Targets:
     The frames of a batch that predictions are compared with, and what predictions come from.
 
     :ivar context: (B, C, 3, H, W) in [-1, 1], augmented, with the first of the keyframes.
-    :ivar keyframes: (B, levels, 3, H, W), augmented; None: there are none.
+    :ivar keyframes: (B, levels, n, 3, H, W), augmented; None: there are none.
     :ivar measured: start and goal as errors are measured with them, see Batch.measured.
     """
 
     def __init__(self, batch: Batch, config: TrainingConfig) -> None:
         self.batch, self.augmentation, self.config = batch, batch.augmentation, config
         self.rows = torch.arange(len(batch.context), device=batch.context.device)
-        self.keyframes = None if batch.keyframes is None else self.augmented(batch.keyframes)
+        self.keyframes = None if batch.keyframes is None else self.augmented(
+            batch.keyframes.flatten(1, 2)).unflatten(1, batch.keyframes.shape[1:3])
         self.context = self.augmented(batch.context)
         self.measured = self.context if batch.bare is None else self.augmented(batch.bare)
         self.context = self.beside(self.context, 0)
 
     def beside(self, context: torch.Tensor, level: int) -> torch.Tensor:
-        """Return contexts (B, C, 3, H, W) with the keyframe of a level, from 0, if any."""
+        """Return contexts (B, C, 3, H, W) with the keyframes of a level, from 0, if any."""
         return context if self.keyframes is None else torch.cat(
-            [context, self.keyframes[:, level:level + 1]], 1)
+            [context, self.keyframes[:, level]], 1)
 
     def augmented(self, pictures: torch.Tensor) -> torch.Tensor:
         """Return pictures, uint8 (B, N, H, W, 3), as networks see them, (B, N, 3, H, W)."""

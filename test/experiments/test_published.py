@@ -124,7 +124,7 @@ def test_the_sentences_of_the_readme_are_those_of_the_data():
         ends['fixed time']) in text
     real = json.loads((RESULTS / 'real.json').read_text())['30']
     (error, _, off), (keyframe_error, _, keyframe_off) = (
-        np.concatenate(real[way], 1) for way in (WAYS['three'][0], 'most alike keyframes'))
+        np.concatenate(real[way], 1) for way in (WAYS['keyframes'][0], 'most alike keyframes'))
     right = share_interval(off <= 1 + 1e-3)
     assert (f'In {right.value:.0%} ({100 * right.low:.0f} to {100 * right.high:.0f}) of 40 '
             'held-out demonstrations the predicted moment is within 1 s') in text

@@ -58,14 +58,14 @@ def test_bottlenecks_are_read_by_their_stamps(tmp_path):
     assert found.frames.shape[1:] == (64, 64, 3)
 
 
-def test_three_pictures_are_compared_with_two_over_tasks_of_several_trainings():
+def test_predictors_with_keyframes_are_compared_over_tasks_of_several_trainings():
     def row(task, method, value, seeds=3):
         share = {'value': value, 'low': value - 0.1, 'high': min(value + 0.1, 1.0)}
         return {'task': task, 'method': method, 'seeds': seeds, 'hit': share, 'near': share}
 
-    rows = [row('aside/a/one', 'marks', 0.5), row('aside/a/one', 'three pictures', 0.7),
-            row('a/two', 'marks', 0.9), row('a/two', 'three pictures', 0.8),
-            row('a/alone', 'marks', 0.1, 1), row('a/alone', 'three pictures', 0.9, 1)]
+    rows = [row('aside/a/one', 'marks', 0.5), row('aside/a/one', 'keyframes', 0.7),
+            row('a/two', 'marks', 0.9), row('a/two', 'keyframes', 0.8),
+            row('a/alone', 'marks', 0.1, 1), row('a/alone', 'keyframes', 0.9, 1)]
     found = command.compare(rows)
     assert found['tasks'] == 2 and found['hit'] == found['near'] == '+5 (-10 to +20)'
     assert found['alone'] == dict.fromkeys(('hit', 'near'), ['one +20 (+6 to +34)'])
@@ -74,7 +74,7 @@ def test_three_pictures_are_compared_with_two_over_tasks_of_several_trainings():
 
 def test_one_method_alone_leaves_what_others_have_scored(tmp_path):
     file, old = tmp_path / 'rows.json', [
-        {'task': 'a', 'method': method, 'hit': 1} for method in ('marks', 'three pictures')]
+        {'task': 'a', 'method': method, 'hit': 1} for method in ('marks', 'keyframes')]
     assert command.merged(file, old[:1]) == old[:1]
     file.write_text(json.dumps(old))
     new = [{'task': 'a', 'method': 'marks', 'hit': 2}, {'task': 'b', 'method': 'marks', 'hit': 3}]

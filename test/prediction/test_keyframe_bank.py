@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of the third picture: where it comes from, what is copied of it, and hostile files."""
+"""Laws of keyframes: where they come from, what is copied of them, and hostile files."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from tap_ros.images.pixels import resize_image, to_float, to_uint8
 from tap_ros.prediction.keyframe_bank import KeyframeBank, MOST
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.protocol import Request
-from tap_ros.prediction.retrieval import ends_of, neighbours
+from tap_ros.prediction.retrieval import ends_of, neighbours, usual_keyframes
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights.weights import load_tensors, save_tensors, save_weights
 import torch
@@ -83,14 +83,14 @@ def test_a_bank_comes_back_from_a_weights_file_as_it_was(network, bank, episodes
 
 def test_a_demonstration_is_shown_its_neighbour_and_never_itself(bank, ends, episodes):
     pairs = np.stack([episode.frames[[0, -1]] for episode in episodes])
-    indices, distances = bank.find(pairs)
-    others, away = neighbours(ends, 1)
-    assert (indices == others[:, 0]).all() and (distances == away[:, 0]).all()
+    indices, distances = bank.find(pairs, 4)
+    others, away = neighbours(ends, 4)
+    assert (indices == others).all() and (distances == away[:, 0]).all()
     noise = np.random.default_rng(0).integers(0, 256, (1, 2, 64, 64, 3), np.uint8)
-    (_,), (far,) = bank.find(noise)
+    _, (far,) = bank.find(noise, 1)
     assert bank.unlike(far) and not any(bank.unlike(one) for one in distances)
     single = KeyframeBank.choose(ends[:1], lambda i: full(episodes[i], 20))
-    assert single.find(pairs)[0].tolist() == [0] * 20
+    assert single.find(pairs, 3)[0].tolist() == [[0] * 3] * 20
 
 
 def test_what_is_alike_is_kept_in_the_weights_file(ends, episodes, tmp_path):
@@ -101,9 +101,9 @@ def test_what_is_alike_is_kept_in_the_weights_file(ends, episodes, tmp_path):
     save_weights(tmp_path / 'w.safetensors', made, 'predictor', made.config, {})
     again = load_network(tmp_path / 'w.safetensors')[0].bank
     pairs = np.stack([episode.frames[[0, -1]] for episode in episodes])
-    indices, distances = again.find(pairs)
-    assert (indices == neighbours(ends, 1, weights)[0][:, 0]).all()
-    assert (indices != neighbours(ends, 1)[0][:, 0]).any()
+    indices, distances = again.find(pairs, 2)
+    assert (indices == neighbours(ends, 2, weights)[0]).all()
+    assert (indices != neighbours(ends, 2)[0]).any()
     assert (distances == neighbours(ends, 1)[1][:, 0]).all()  # what is unlike, is so anywhere
     tensors, metadata = load_tensors(tmp_path / 'w.safetensors')
     for wrong in (-weights, 0 * weights, weights.astype(np.int64), weights[:1], weights * 200):
@@ -113,16 +113,20 @@ def test_what_is_alike_is_kept_in_the_weights_file(ends, episodes, tmp_path):
             load_network(tmp_path / 'v.safetensors')
     del tensors['bank.weights']  # of a file that was written before there were any
     save_tensors(tmp_path / 'v.safetensors', tensors, metadata)
-    assert (load_network(tmp_path / 'v.safetensors')[0].bank.find(pairs)[0] == neighbours(
-        ends, 1)[0][:, 0]).all()
+    assert (load_network(tmp_path / 'v.safetensors')[0].bank.find(pairs, 1)[0] == neighbours(
+        ends, 1)[0]).all()
 
 
-def test_the_network_is_given_the_third_picture_by_whoever_asks(network, bank, episodes):
+@pytest.mark.parametrize('count', [1, 3])
+def test_the_network_is_given_keyframes_by_whoever_asks(count, bank, episodes):
+    network = lively_network(num_context=2 + count, image_size=64)
+    network.bank = bank
     predictor = SubgoalPredictor(network)
     chosen = [1, 4, 7]
     pairs = np.stack([episodes[i].frames[[0, -1]] for i in chosen])
-    keyframes = [resize_image(bank.keyframes[i], (64, 64)) for i in bank.find(pairs)[0]]
-    context = torch.cat([to_float(pairs), to_float(np.stack(keyframes))[:, None]], 1)
+    keyframes = [[resize_image(bank.keyframes[i], (64, 64)) for i in each]
+                 for each in bank.find(pairs, count)[0]]
+    context = torch.cat([to_float(pairs), to_float(np.array(keyframes))], 1)
     with torch.inference_mode():
         given, found = network(context), network(to_float(pairs))
     assert given.image.equal(found.image)
@@ -133,9 +137,9 @@ def test_the_network_is_given_the_third_picture_by_whoever_asks(network, bank, e
             assert np.abs(shown.astype(int) - to_uint8(given.image)[b]).mean() < 0.1
 
 
-@pytest.mark.parametrize('known', [False, True])
-def test_a_network_is_scored_as_the_predictor_that_it_becomes(bank, levels, known):
-    network = lively_network(num_context=3, image_size=64)
+@pytest.mark.parametrize('known, count', [(False, 1), (True, 1), (True, 3)])
+def test_a_network_is_scored_as_the_predictor_that_it_becomes(bank, levels, known, count):
+    network = lively_network(num_context=2 + count, image_size=64)
     network.bank = levels if known else bank
     store, chosen = open_recordings([BAG], progress=False), [1, 4, 7]
     as_network, as_predictor = (evaluate(asked, store, chosen)['prediction']
@@ -148,7 +152,7 @@ def test_a_network_is_scored_as_the_predictor_that_it_becomes(bank, levels, know
 def test_recursion_puts_the_prediction_between_start_and_keyframe(network, bank, episodes):
     episode = episodes[5]
     earlier, later = ask(SubgoalPredictor(network), episode, recursion_depth=2)
-    keyframe = bank.scaled((64, 64))[bank.find(episode.frames[None, [0, -1]])[0][0]]
+    keyframe = bank.scaled((64, 64))[bank.find(episode.frames[None, [0, -1]], 1)[0][0, 0]]
     with torch.inference_mode():
         again = network(to_float(np.stack([episode.frames[0], later.image, keyframe]))[None])
     assert np.abs(earlier.image.astype(int) - to_uint8(again.image)[0]).mean() < 1
@@ -196,7 +200,7 @@ def test_each_level_of_recursion_has_a_keyframe_and_objects_are_where_it_has_the
     start, goal = (full(episode, t) for t in (0, -1))
     pixels = episode.object_pixels[[0, -1]] * 2 + 0.5  # in pictures of 128 px
     alike = episodes[levels.find(np.stack([
-        resize_image(one, (64, 64)) for one in (start, goal)])[None])[0][0]]
+        resize_image(one, (64, 64)) for one in (start, goal)])[None], 1)[0][0, 0]]
     of_start = pixels[0, ::-1]  # whatever their order: by where they begin
     order = [int(np.linalg.norm(alike.object_pixels[0] * 2 - at, axis=1).argmin())
              for at in of_start]
@@ -223,13 +227,13 @@ def test_an_object_of_which_a_keyframe_knows_nothing_is_nowhere_in_it(episodes, 
     bank = KeyframeBank.choose(ends, lambda i: full(episodes[i], 20), places)
     maps = torch.zeros(1, 2, 3, 64, 64)
     asked = np.concatenate([places[7, 0], [[5, 5]]])
-    added = bank.beside_maps(maps, [asked], np.array([7]))[0, 2]
+    added = bank.beside_maps(maps, [asked], np.array([[7]]))[0, 2]
     assert added.sum((1, 2)).tolist() == pytest.approx([1, 0, 0])
     v, u = divmod(int(added[0].argmax()), 64)
     assert np.abs(np.array([u, v]) - places[7, 1, 0]).max() <= 0.5
     again = KeyframeBank.take(bank.tensors(), 'file')
-    assert again.beside_maps(maps, [asked], np.array([7])).equal(
-        bank.beside_maps(maps, [asked], np.array([7])))
+    assert again.beside_maps(maps, [asked], np.array([[7]])).equal(
+        bank.beside_maps(maps, [asked], np.array([[7]])))
     assert all(tensor.isfinite().all() for tensor in bank.tensors().values())
 
 
@@ -237,7 +241,7 @@ def test_the_keyframe_is_copied_at_its_full_size(copying, bank, episodes):
     start, goal = full(episodes[2], 0), full(episodes[2], -1)
     subgoal, = copying.predict(start, goal)
     pair = np.stack([resize_image(one, (64, 64)) for one in (start, goal)])
-    keyframe = bank.keyframes[bank.find(pair[None])[0][0]]
+    keyframe = bank.keyframes[bank.find(pair[None], 1)[0][0, 0]]
     assert subgoal.image.shape == (128, 128, 3)
     assert (subgoal.image[:, 70:] == keyframe[:, 70:]).all()
     assert (subgoal.image[:, :58] == start[:, :58]).all()
@@ -303,7 +307,7 @@ def test_weights_for_two_pictures_have_no_bank(network, bank, tmp_path):
     save_weights(tmp_path / 'two', two, 'predictor', two.config, {})
     with pytest.raises(WeightsError, match='2 pictures with a bank'):
         load_network(tmp_path / 'two')
-    with pytest.raises(ConfigError, match='3 with a bank'):
+    with pytest.raises(ConfigError, match='more with a bank'):
         SubgoalPredictor(two)
     with pytest.raises(ConfigError, match='these are for 3'):
         SubgoalPredictor(lively_network(num_context=3))
@@ -311,3 +315,21 @@ def test_weights_for_two_pictures_have_no_bank(network, bank, tmp_path):
         **network.state_dict()}.items()} | bank.tensors(), 'predictor', network.config, {})
     with pytest.raises(WeightsError, match='all weights are zero'):
         load_network(tmp_path / 'zero')
+
+
+def test_each_of_several_keyframes_has_its_objects(levels, episodes):
+    asked = np.stack([episodes[i].object_pixels[0] for i in (3, 5)]).astype(np.float32)
+    chosen, maps = np.array([[7, 2, 9], [1, 1, 4]]), torch.zeros(2, 2, 2, 64, 64)
+    together = levels.beside_maps(maps, asked, chosen, 2)
+    assert together.shape == (2, 5, 2, 64, 64)
+    for b, k in np.ndindex(2, 3):
+        alone = levels.beside_maps(maps[:1], asked[b:b + 1], chosen[b:b + 1, k:k + 1], 2)
+        assert together[b, 2 + k].equal(alone[0, 2])
+
+
+def test_a_frame_of_another_moment_is_no_usual_keyframe(episodes, ends):
+    keyframes = np.stack([one.frames[None, -1] for one in episodes])
+    keyframes[[4, 11]] = 255 - keyframes[[4, 11]]
+    assert np.flatnonzero(~usual_keyframes(ends, keyframes)).tolist() == [4, 11]
+    assert usual_keyframes(ends, 0 * keyframes).all()
+    assert usual_keyframes(ends[:2], keyframes[3:5]).all()

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of trainings with a third picture: labelled frames of the most alike demonstrations."""
+"""Laws of trainings with keyframes: labelled frames of the most alike demonstrations."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
 from tap_ros.training.batches import Pictures
 from tap_ros.training.frames import FilledStore
-from tap_ros.training.keyframes import Keyframes, NEIGHBOURS
+from tap_ros.training.keyframes import Keyframes, NEIGHBOURS, SHOWN
 from tap_ros.training.marks import episode_preferences
 from tap_ros.training.objective import Networks, predictor_loss
 from tap_ros.training.predictor import draw_batch, train
@@ -53,10 +53,30 @@ def test_what_is_drawn_is_the_label_of_another_demonstration_that_is_alike(store
              for n, i in enumerate(episodes)}
     drawn = {i: set() for i in episodes}
     for _ in range(30):
-        for i, picture in zip(episodes, keyframes.draw(episodes, rng)[:, 0].numpy()):
-            drawn[i].add(picture.tobytes())
+        for i, pictures in zip(episodes, keyframes.draw(episodes, rng)[:, 0].numpy()):
+            assert len({picture.tobytes() for picture in pictures}) == SHOWN
+            drawn[i] |= {picture.tobytes() for picture in pictures}
     assert all(drawn[i] <= shown[i] for i in episodes)
     assert np.mean([len(drawn[i]) / len(shown[i]) for i in episodes]) > 0.9
+
+
+def test_a_demonstration_whose_label_shows_something_else_is_left_out(
+        store, config, tmp_path, capsys):
+    frames = store.frames(7).copy()
+    frames[1] = 255 - frames[1]
+    bag = write_bag(tmp_path / 'odd', [
+        replace(one, frames=frames) if i == 7 else one for i, one in enumerate(store)])
+    odd, everything = open_recordings([bag], progress=False), np.arange(len(store))
+    labels = [1 if i == 7 else int(n) // 2 for i, n in enumerate(odd.lengths)]
+    preference = [np.eye(int(n), dtype=np.float32)[[t]] for n, t in zip(odd.lengths, labels)]
+    keyframes = Keyframes(odd, everything, preference, config)
+    assert 7 in keyframes.left_out and len(keyframes.left_out) < 5
+    drawn = keyframes.draw(everything, np.random.default_rng(0)).flatten(0, 2).numpy()
+    assert all((picture != frames[1]).any() for picture in drawn)
+    assert len(keyframes.bank()) == len(store) - len(keyframes.left_out)
+    write_marks(config.marks, odd, [bag], {i: [(t, t)] for i, t in enumerate(labels[:8])})
+    train(replace(config, recordings=(str(bag),), test_fraction=0.0, steps=1), progress=False)
+    assert 'keyframes: those of demonstrations 7 are left out' in capsys.readouterr().err
 
 
 def test_weights_hold_the_keyframes_of_the_training_and_answer_with_them(store, config):
@@ -66,7 +86,7 @@ def test_weights_hold_the_keyframes_of_the_training_and_answer_with_them(store, 
     for name, tensor in load_weights(whole, 'predictor')[1].items():
         assert (tensor == load_weights(weights, 'predictor')[1][name]).all(), name
     network, training = load_network(weights)
-    assert network.config.num_context == 3 and isinstance(network.bank, KeyframeBank)
+    assert network.config.num_keyframes == SHOWN and isinstance(network.bank, KeyframeBank)
     assert len(network.bank) == training['episodes'] == 24 - training['held_out']
     frames = store.frames(20)
     subgoal, = SubgoalPredictor(network, training).predict_together([Request(
@@ -119,13 +139,13 @@ def test_each_level_is_trained_with_its_own_keyframe(store, config):
         preference=preference, keyframes=keyframes), 0)
     assert batch.context.shape[1] == 2 and batch.keyframes.shape[1] == 2
     assert (batch.keyframes[:, 0] != batch.keyframes[:, 1]).any()
-    shown, network = [], lively_network(num_context=3, image_size=store.image_size[0])
+    shown, network = [], lively_network(
+        num_context=2 + SHOWN, image_size=store.image_size[0])
     network.register_forward_pre_hook(lambda _, given: shown.append(given[0]))
     predictor_loss(Networks(network), batch, config)
-    augmented = batch.augmentation.apply(to_float(batch.keyframes))
     assert len(shown) == 2
     for level, given in enumerate(shown):
-        assert given.shape[1] == 3 and given[:, 2].equal(augmented[:, level])
+        assert given[:, 2:].equal(batch.augmentation.apply(to_float(batch.keyframes[:, level])))
     assert shown[0][:, 0].equal(shown[1][:, 0]) and not shown[0][:, 1].equal(shown[1][:, 1])
 
 
