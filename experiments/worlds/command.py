@@ -260,7 +260,7 @@ def page(rows):
 
 def compare(rows):
     """
-    Compare predictors with keyframes with those without, over the tasks with several trainings of both.
+    Compare predictors with and without keyframes, over the tasks with several trainings of both.
 
     :return: dict: tasks, how many; hit and near, in words the mean difference in points with its
         interval over the tasks, whose demonstrations and marks both had; alone, by hit and near
