@@ -156,5 +156,6 @@ class Simulator(Table):
         for name, place in zip(self.object_names, places):
             if not (np.abs(place) <= limit).all():  # not a number is no place either
                 raise SceneError(
-                    f'{name} would be out of reach, at x {place[0]:.3f} m, y {place[1]:.3f} m; '
-                    f'expected within {limit:g} m of the middle, along x and y')
+                    f'the goal of {name} is out of reach, at x {place[0]:.3f} m, '
+                    f'y {place[1]:.3f} m; expected within {limit:g} m of the middle, along x '
+                    'and y')

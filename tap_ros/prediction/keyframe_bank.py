@@ -26,8 +26,8 @@ from tap_ros.prediction.retrieval import (
     EQUAL,
     LARGEST_WEIGHT,
     nearest_others,
+    pad_columns,
     places_then,
-    repeated,
     SIDE,
     spread_out,
     unlike,
@@ -170,7 +170,7 @@ class KeyframeBank:
         asked = np.stack([ends_of(*pair) for pair in pictures])
         indices, _ = nearest_others(asked, self._ends, count, self._weights)
         _, distances = nearest_others(asked, self._ends, 1)
-        return repeated(indices, count), distances[:, 0]
+        return pad_columns(indices, count), distances[:, 0]
 
     def unlike(self, distance: float) -> str:
         """Say that start and goal are unlike those of all demonstrations; '': they are not."""
@@ -181,7 +181,7 @@ class KeyframeBank:
         return self.beside(context, self.find(to_uint8(context), count)[0])
 
     def numbers(self, indices: np.ndarray, level: int = 1) -> np.ndarray:
-        """Return which keyframes demonstrations have at a level, from 1; or at the last."""
+        """Return which keyframes demonstrations (any shape) have at a level, from 1 on."""
         return indices * self.levels + min(level, self.levels) - 1
 
     def beside(self, context: torch.Tensor, indices: np.ndarray, level: int = 1) -> torch.Tensor:

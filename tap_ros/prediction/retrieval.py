@@ -5,7 +5,8 @@ Which demonstrations are most alike, by small pictures of their start and goal.
 
 Distances are root mean squares of the differences of pixels, 0 to 255, each pixel with a weight.
 They are found in whole numbers, so that they are the same on every machine; of equal ones the
-first index comes first. Weights are learned: demonstrations are alike whose keyframes are.
+first index comes first. Weights are learned, once in a training: demonstrations are alike whose
+keyframes are.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ SIDE = 16  # px of a small picture, whose pixels are the means of areas
 LARGEST = 255.0  # distance of white from black
 LARGEST_WEIGHT = 1000
 EQUAL = np.ones((2, SIDE, SIDE), np.int32)  # weights of the plain distance
-COMPARED, UNUSUAL = 5, 1.5  # demonstrations, and factor, see usual_keyframes
+COMPARED, OUTLIER = 5, 2.0  # demonstrations, and factor, see inlier_keyframes
 _ROWS = 256  # whose distances from all others are held at once
 _LEARNED_FROM = 128  # demonstrations at most
 _SHRINKAGE = 0.1  # of learned weights towards equal ones
@@ -86,8 +87,8 @@ def nearest_others(asked: np.ndarray, known: np.ndarray, count: int,
     return (np.take_along_axis(indices, columns, 1), np.take_along_axis(distances, columns, 1))
 
 
-def repeated(columns: np.ndarray, count: int) -> np.ndarray:
-    """Return (N, count): columns (N, n) of n at most count, the last one again and again."""
+def pad_columns(columns: np.ndarray, count: int) -> np.ndarray:
+    """Return columns (N, n) as (N, count), the last one repeated; n is at most count."""
     return np.pad(columns, ((0, 0), (0, count - columns.shape[1])), 'edge')
 
 
@@ -134,26 +135,26 @@ def learned_weights(ends: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
     return whole.reshape(EQUAL.shape) if whole.any() else EQUAL
 
 
-def usual_keyframes(ends: np.ndarray, keyframes: np.ndarray,
-                    weights: np.ndarray = EQUAL) -> np.ndarray:
+def inlier_keyframes(ends: np.ndarray, keyframes: np.ndarray,
+                     weights: np.ndarray = EQUAL) -> np.ndarray:
     """
-    Say which keyframes look like those of the most alike demonstrations.
+    Return which keyframes look like those of the most alike demonstrations.
 
-    The others are mostly frames of another moment, by a wrong label.
+    An outlier often has a wrong label. What is compared is the squared distance of small
+    pictures from those of the COMPARED most alike demonstrations, in the median.
 
     :param ends: uint8 (N, 2, SIDE, SIDE, 3); weights: as nearest takes them.
-    :param keyframes: uint8 (N, L, H, W, 3).
-    :return: bool (N,), False where they are UNUSUAL times as far from those of the COMPARED most
-        alike, in the median, as is usual; so of most it is True.
+    :param keyframes: uint8 (N, L, H, W, 3); of several levels the distances are added.
+    :return: bool (N,), False where the distance is over OUTLIER times that of those most alike
+        and that of all, medians both. All True for fewer than three demonstrations.
     """
     if len(ends) < 3:
         return np.ones(len(ends), bool)
     near, _ = neighbours(ends, COMPARED, weights)
     small = np.stack([[_smaller(picture) for picture in each] for each in keyframes])
-    shown = small.reshape(len(ends), -1).astype(np.float32)
-    away = np.median([np.square(shown[near[:, k]] - shown).mean(1)
-                      for k in range(near.shape[1])], 0)
-    return np.asarray(away <= UNUSUAL ** 2 * np.median(away))
+    rows = small.reshape(len(ends), -1).astype(np.int64)
+    away = np.median([((rows[near[:, k]] - rows) ** 2).sum(1) for k in range(near.shape[1])], 0)
+    return np.asarray(away <= OUTLIER * np.maximum(np.median(away[near], 1), np.median(away)))
 
 
 def _squares(pictures: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -113,9 +113,9 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
 
     p = sum over c of mask_c * warp(map_c, flow_c), divided by its sum. A map that loses nearly
     all its mass (the flow jumps over the object's pixel) is blurred by one pixel before warping;
-    if that does not help, the object is where a keyframe has it, which is after start and goal;
-    else it is the mask-weighted mixture of the maps where they were, and if the masks hide these
-    too, their plain mean.
+    if that does not help, the object is where the first keyframe that has it shows it, keyframes
+    being after start and goal; else it is the mask-weighted mixture of the maps where they were,
+    and if the masks hide these too, their plain mean.
 
     :param maps: (B, C, K, H, W), maps in each context picture, each summing to 1; those of start
         and goal. In a keyframe of another demonstration also 0: nothing is known of the object.

@@ -12,10 +12,10 @@ from tap_ros.base.errors import ImageError
 from tap_ros.prediction.keyframe_bank import KeyframeBank, MOST_OBJECTS
 from tap_ros.prediction.retrieval import (
     ends_of,
+    inlier_keyframes,
     learned_weights,
-    nearest_others,
-    repeated,
-    usual_keyframes,
+    nearest,
+    pad_columns,
 )
 from tap_ros.recording.full_size import FullSize
 import torch
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from tap_ros.training.frames import FilledStore
     from tap_ros.training.predictor_config import TrainingConfig
 
-SHOWN = 3  # demonstrations whose keyframes a network sees
-NEIGHBOURS = 5  # of which they are drawn, so that their pictures must be moved
+NUM_KEYFRAMES = 3  # that a network sees, of as many demonstrations
+NEIGHBOURS = 5  # demonstrations of which these are drawn, others in each step
 
 
 class Keyframes:
@@ -37,7 +37,7 @@ class Keyframes:
     :param preference: of each episode of the store w (levels, T); the largest ones are the labels.
     :param config: of the training.
     :param filled: the store without the robot: keyframes are as targets are.
-    :ivar left_out: those of the episodes whose labels are not to be trusted.
+    :ivar left_out: list of int, the episodes whose keyframes are left out.
     """
 
     def __init__(self, store: 'EpisodeStore', episodes: np.ndarray,
@@ -50,18 +50,25 @@ class Keyframes:
         ends = np.stack([ends_of(*given.frames(i)[[0, -1]]) for i in rows])
         shown = store if filled is None else filled
         pictures = np.stack([shown.frames(i)[at] for i, at in zip(rows, labels)])
-        kept = usual_keyframes(ends, pictures, learned_weights(ends, pictures))
+        self._weights = learned_weights(ends, pictures)
+        kept = inlier_keyframes(ends, pictures, self._weights)
         self.left_out = episodes[~kept].tolist()
         self._kept, self._labels, self._ends = episodes[kept], labels[kept], ends[kept]
-        self._pictures = torch.from_numpy(pictures[kept])
-        self._weights = learned_weights(self._ends, pictures[kept])
-        self._near, _ = nearest_others(ends, self._ends, NEIGHBOURS, self._weights)
+        if self.left_out:
+            pictures = pictures[kept]
+            self._weights = learned_weights(self._ends, pictures)
+        self._pictures = torch.from_numpy(pictures)
+        near, _ = nearest(ends, self._ends, NEIGHBOURS + 1, weights=self._weights)
+        own = np.where(kept, kept.cumsum() - 1, -1)[:, None]  # which comes last
+        order = (near == own).argsort(1, kind='stable')[:, :max(1, near.shape[1] - 1)]
+        self._near = np.take_along_axis(near, order, 1)
 
     def draw(self, chosen: np.ndarray, rng: np.random.Generator) -> torch.Tensor:
-        """Return uint8 (B, levels, SHOWN, H, W, 3), of some of the most alike, in their order."""
+        """Return uint8 (B, levels, NUM_KEYFRAMES, H, W, 3) of some, the most alike first."""
         near = self._near[np.searchsorted(self._episodes, chosen)]
-        drawn = np.sort(rng.random(near.shape).argsort(1)[:, :SHOWN], 1)
-        return self._pictures[repeated(np.take_along_axis(near, drawn, 1), SHOWN)].transpose(1, 2)
+        drawn = np.sort(rng.random(near.shape).argsort(1)[:, :NUM_KEYFRAMES], 1)
+        return self._pictures[pad_columns(
+            np.take_along_axis(near, drawn, 1), NUM_KEYFRAMES)].transpose(1, 2)
 
     def bank(self) -> KeyframeBank:
         """Return the bank that goes with the weights, of pictures at the recorded size."""

@@ -21,7 +21,7 @@ from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.augmentation import Augmentation
 from tap_ros.training.batches import Batch, episode_order, make_batch, Pictures, Sampling
 from tap_ros.training.frames import FilledStore, has_room, ResidentFrames
-from tap_ros.training.keyframes import Keyframes, SHOWN
+from tap_ros.training.keyframes import Keyframes, NUM_KEYFRAMES
 from tap_ros.training.marks import episode_preferences
 from tap_ros.training.objective import (
     discriminators_loss,
@@ -116,7 +116,7 @@ def make_networks(run: Run[TrainingConfig],
     vae, longest = config.latent == 'vae', int(run.store.lengths.max())
     shape = PredictorConfig(
         image_size=run.store.image_size[0], base_width=config.base_width,
-        num_context=1 if config.forward else 2 + SHOWN * config.keyframes,
+        num_context=1 if config.forward else 2 + NUM_KEYFRAMES * config.keyframes,
         latent_size=LATENT_SIZE if vae else 0, new_pixels=config.new_pixels,
         decoder=config.decoder, skips=config.skips)
     network, helpers = PredictorNetwork(shape), dict[str, torch.nn.Module]()
@@ -163,9 +163,9 @@ def draw_batch(store: EpisodeStore, episodes: np.ndarray, config: TrainingConfig
 def _print_left_out(keyframes: Keyframes) -> None:
     """Print before a training whose labelled frames are not shown as keyframes; on stderr."""
     if left_out := [str(i) for i in keyframes.left_out]:
-        print(f'keyframes: those of demonstrations {listing(left_out, 10)} are left out, they are '
-              'unlike those of similar demonstrations; where a label is wrong, mark that one',
-              file=sys.stderr)
+        print(f'keyframes: the labelled frames of {listing(left_out, 10)} differ from those of '
+              'similar demonstrations and are not shown to the network. Check these labels; mark '
+              'those that are wrong', file=sys.stderr)
 
 
 def _values(outcome: Outcome, batch: Batch) -> dict[str, torch.Tensor]:

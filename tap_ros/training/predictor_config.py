@@ -53,7 +53,7 @@ class TrainingConfig(RunConfig):
     :param label_weight: of log w(t) beside the l1 error, with selection marks; w(t) is how likely
         a frame is the label. 0: any of the likeliest frames alike.
     :param keyframes: the network is also given the labelled frames of the three demonstrations
-        that are most alike, to copy from, with recursion such for each level; the weights file
+        that are most alike, to copy from, with recursion those of each level; the weights file
         holds such frames of up to 64 demonstrations, and where the objects are in them.
     :param gan: add the GAN's terms (Eq. 7).
     :param latent: 'vae' adds z (Eq. 9, with a GAN Eq. 10).

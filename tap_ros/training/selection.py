@@ -53,7 +53,7 @@ class Targets:
     """
     The frames of a batch that predictions are compared with, and what predictions come from.
 
-    :ivar context: (B, C, 3, H, W) in [-1, 1], augmented, with the first of the keyframes.
+    :ivar context: (B, C, 3, H, W) in [-1, 1], augmented, with the keyframes of the first level.
     :ivar keyframes: (B, levels, n, 3, H, W), augmented; None: there are none.
     :ivar measured: start and goal as errors are measured with them, see Batch.measured.
     """

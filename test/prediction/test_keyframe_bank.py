@@ -14,7 +14,7 @@ from tap_ros.images.pixels import resize_image, to_float, to_uint8
 from tap_ros.prediction.keyframe_bank import KeyframeBank, MOST
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.protocol import Request
-from tap_ros.prediction.retrieval import ends_of, neighbours, usual_keyframes
+from tap_ros.prediction.retrieval import ends_of, inlier_keyframes, neighbours
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights.weights import load_tensors, save_tensors, save_weights
 import torch
@@ -327,9 +327,9 @@ def test_each_of_several_keyframes_has_its_objects(levels, episodes):
         assert together[b, 2 + k].equal(alone[0, 2])
 
 
-def test_a_frame_of_another_moment_is_no_usual_keyframe(episodes, ends):
+def test_keyframes_unlike_those_of_similar_demonstrations_are_outliers(episodes, ends):
     keyframes = np.stack([one.frames[None, -1] for one in episodes])
     keyframes[[4, 11]] = 255 - keyframes[[4, 11]]
-    assert np.flatnonzero(~usual_keyframes(ends, keyframes)).tolist() == [4, 11]
-    assert usual_keyframes(ends, 0 * keyframes).all()
-    assert usual_keyframes(ends[:2], keyframes[3:5]).all()
+    assert np.flatnonzero(~inlier_keyframes(ends, keyframes)).tolist() == [4, 11]
+    assert inlier_keyframes(ends, 0 * keyframes).all()
+    assert inlier_keyframes(ends[:2], keyframes[3:5]).all()

@@ -127,5 +127,5 @@ def test_saved_weights_answer_the_same_and_those_that_predict_nonsense_are_refus
         SubgoalPredictor.load(path)
     video = replace(CONFIG, num_context=4)
     save_weights(path, PredictorNetwork(video), 'predictor', video, {})
-    with pytest.raises(ConfigError, match='2 context pictures'):
+    with pytest.raises(WeightsError, match='4 pictures without a bank'):
         SubgoalPredictor.load(path)

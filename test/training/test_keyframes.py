@@ -18,7 +18,7 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
 from tap_ros.training.batches import Pictures
 from tap_ros.training.frames import FilledStore
-from tap_ros.training.keyframes import Keyframes, NEIGHBOURS, SHOWN
+from tap_ros.training.keyframes import Keyframes, NEIGHBOURS, NUM_KEYFRAMES
 from tap_ros.training.marks import episode_preferences
 from tap_ros.training.objective import Networks, predictor_loss
 from tap_ros.training.predictor import draw_batch, train
@@ -54,7 +54,7 @@ def test_what_is_drawn_is_the_label_of_another_demonstration_that_is_alike(store
     drawn = {i: set() for i in episodes}
     for _ in range(30):
         for i, pictures in zip(episodes, keyframes.draw(episodes, rng)[:, 0].numpy()):
-            assert len({picture.tobytes() for picture in pictures}) == SHOWN
+            assert len({picture.tobytes() for picture in pictures}) == NUM_KEYFRAMES
             drawn[i] |= {picture.tobytes() for picture in pictures}
     assert all(drawn[i] <= shown[i] for i in episodes)
     assert np.mean([len(drawn[i]) / len(shown[i]) for i in episodes]) > 0.9
@@ -76,7 +76,30 @@ def test_a_demonstration_whose_label_shows_something_else_is_left_out(
     assert len(keyframes.bank()) == len(store) - len(keyframes.left_out)
     write_marks(config.marks, odd, [bag], {i: [(t, t)] for i, t in enumerate(labels[:8])})
     train(replace(config, recordings=(str(bag),), test_fraction=0.0, steps=1), progress=False)
-    assert 'keyframes: those of demonstrations 7 are left out' in capsys.readouterr().err
+    assert 'the labelled frames of 7 differ' in capsys.readouterr().err
+
+
+def test_no_demonstration_is_shown_its_own_label(store, config, tmp_path):
+    """Nor where others begin and end exactly alike."""
+    same = [replace(one, frames=np.concatenate([
+        store.frames(0)[:1], one.frames[1:-1], store.frames(0)[-1:]])) for one in store]
+    bag = write_bag(tmp_path / 'same', same)
+    alike, everything = open_recordings([bag], progress=False), np.arange(len(store))
+    labels = [int(n) // 2 for n in alike.lengths]
+    preference = [np.eye(int(n), dtype=np.float32)[[t]] for n, t in zip(alike.lengths, labels)]
+    keyframes, rng = Keyframes(alike, everything, preference, config), np.random.default_rng(0)
+    for _ in range(10):
+        for i, shown in enumerate(keyframes.draw(everything, rng)[:, 0].numpy()):
+            assert all((picture != alike.frames(i)[labels[i]]).any() for picture in shown)
+
+
+@pytest.mark.parametrize('count', [1, 2, 3])
+def test_few_demonstrations_show_as_many_keyframes(store, config, count):
+    episodes = np.arange(count)
+    preference = [np.eye(int(n), dtype=np.float32)[[2]] for n in store.lengths]
+    keyframes = Keyframes(store, episodes, preference, config)
+    drawn = keyframes.draw(episodes, np.random.default_rng(0))
+    assert drawn.shape[:3] == (count, 1, NUM_KEYFRAMES) and len(keyframes.bank()) == count
 
 
 def test_weights_hold_the_keyframes_of_the_training_and_answer_with_them(store, config):
@@ -86,7 +109,7 @@ def test_weights_hold_the_keyframes_of_the_training_and_answer_with_them(store, 
     for name, tensor in load_weights(whole, 'predictor')[1].items():
         assert (tensor == load_weights(weights, 'predictor')[1][name]).all(), name
     network, training = load_network(weights)
-    assert network.config.num_keyframes == SHOWN and isinstance(network.bank, KeyframeBank)
+    assert network.config.num_keyframes == NUM_KEYFRAMES and isinstance(network.bank, KeyframeBank)
     assert len(network.bank) == training['episodes'] == 24 - training['held_out']
     frames = store.frames(20)
     subgoal, = SubgoalPredictor(network, training).predict_together([Request(
@@ -140,7 +163,7 @@ def test_each_level_is_trained_with_its_own_keyframe(store, config):
     assert batch.context.shape[1] == 2 and batch.keyframes.shape[1] == 2
     assert (batch.keyframes[:, 0] != batch.keyframes[:, 1]).any()
     shown, network = [], lively_network(
-        num_context=2 + SHOWN, image_size=store.image_size[0])
+        num_context=2 + NUM_KEYFRAMES, image_size=store.image_size[0])
     network.register_forward_pre_hook(lambda _, given: shown.append(given[0]))
     predictor_loss(Networks(network), batch, config)
     assert len(shown) == 2
