@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import math
 from pathlib import Path
 import sys
 from typing import Annotated, TYPE_CHECKING
@@ -119,8 +120,9 @@ def run(args: Options) -> None:
     write_atomically(args.out, labelled(parts, places, subgoals))
     print(f'written: {escaped(args.out)}')
     if not names:
+        scenes = ' and whether the weights know such scenes' * math.isnan(subgoals[0].distance)
         print('note: without --objects it is not checked whether all objects are in the '
-              'prediction and whether the weights know such scenes; look at the picture')
+              f'prediction{scenes}; look at the picture')
 
 
 def read_inputs(files: Mapping[str, str], positions: Mapping[str, Sequence[str]],

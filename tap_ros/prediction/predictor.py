@@ -50,7 +50,8 @@ class SubgoalPredictor(Predictor):
         if (network.bank is None) == (network.config.num_keyframes > 0):
             raise ConfigError('predictor: needs weights for 2 context pictures, start and goal, '
                               'for 1, the start, or for more with a bank of keyframes; these are '
-                              f'for {network.config.num_context}')
+                              f'for {network.config.num_context} with'
+                              f'{"out" * (network.bank is None)} one')
         self.config = network.config
         self.mode = 'forward' if network.config.num_context == 1 else 'bidirectional'
         self.image_size = (network.config.image_size, network.config.image_size)

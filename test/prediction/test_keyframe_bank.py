@@ -160,9 +160,9 @@ def test_recursion_puts_the_prediction_between_start_and_keyframe(network, bank,
     assert earlier.distance == later.distance and not earlier.warning
 
 
-def copies(bank):
-    """Return a predictor that copies the keyframe, except for the left half: the start."""
-    made = lively_network(num_context=3, image_size=64)
+def copies(bank, count=1, shown=0):
+    """Return a predictor that copies one of count keyframes; for the left half, the start."""
+    made = lively_network(num_context=2 + count, image_size=64)
     made.bank = bank
     forward = made.forward
 
@@ -170,7 +170,7 @@ def copies(bank):
         found = forward(context, z)
         found.flow.zero_()
         found.masks.zero_()
-        found.masks[:, 0, ..., :32], found.masks[:, 2, ..., 32:] = 1, 1
+        found.masks[:, 0, ..., :32], found.masks[:, 2 + shown, ..., 32:] = 1, 1
         return found
 
     made.forward = half
@@ -237,14 +237,17 @@ def test_an_object_of_which_a_keyframe_knows_nothing_is_nowhere_in_it(episodes, 
     assert all(tensor.isfinite().all() for tensor in bank.tensors().values())
 
 
-def test_the_keyframe_is_copied_at_its_full_size(copying, bank, episodes):
-    start, goal = full(episodes[2], 0), full(episodes[2], -1)
-    subgoal, = copying.predict(start, goal)
-    pair = np.stack([resize_image(one, (64, 64)) for one in (start, goal)])
-    keyframe = bank.keyframes[bank.find(pair[None], 1)[0][0, 0]]
-    assert subgoal.image.shape == (128, 128, 3)
-    assert (subgoal.image[:, 70:] == keyframe[:, 70:]).all()
-    assert (subgoal.image[:, :58] == start[:, :58]).all()
+@pytest.mark.parametrize('count, shown', [(1, 0), (3, 0), (3, 1), (3, 2)])
+def test_each_keyframe_is_copied_at_its_full_size(count, shown, bank, episodes):
+    chosen = [2, 6]
+    pictures = [[full(episodes[i], t) for t in (0, -1)] for i in chosen]
+    found = copies(bank, count, shown).predict_together([Request(*pair) for pair in pictures])
+    alike, _ = bank.find(np.stack([[resize_image(one, (64, 64)) for one in pair]
+                                   for pair in pictures]), count)
+    for (subgoal,), (start, _), numbers in zip(found, pictures, alike):
+        assert subgoal.image.shape == (128, 128, 3)
+        assert (subgoal.image[:, 70:] == bank.keyframes[numbers[shown]][:, 70:]).all()
+        assert (subgoal.image[:, :58] == start[:, :58]).all()
 
 
 def test_a_bank_is_bounded_and_covers_what_it_is_chosen_from(episodes):
