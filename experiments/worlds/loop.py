@@ -46,7 +46,8 @@ from tqdm import tqdm
 BAGS = {'random': 100_000, 'goal': 0}  # of pushes; the first seed
 METHODS = (*UNTRAINED, *PLANNED)
 FILMED = ('subgoal', 'places')  # the first that is there beside direct
-LEARNED = ('fixed time', 'subgoal')  # of which each seed trains all networks anew
+LEARNED = ('fixed time', 'subgoal')  # with a predictor of their own
+REPEATED = ('direct', *LEARNED)  # by the networks of each seed; others by those of the first one
 RESULTS = Path(__file__).resolve().parents[2] / 'docs' / 'results'
 MARKED, MOVED = 12, 1.0  # demonstrations; px, beyond which an object has begun to move
 AT, RESTS, JOLT = 0.06, 0.005, 0.025  # m: by the way; in a period of rest; as the hand leaves
@@ -75,8 +76,8 @@ class Options:
     :param steps: of the training of each forward model.
     :param predictor_steps: of the training of each predictor.
     :param methods: that act in each scene.
-    :param seeds: trainings of a forward model and of each predictor; the other methods plan with
-        the first forward model.
+    :param seeds: trainings of a forward model and of each predictor; places and retrieval plan
+        with the first forward model.
     :param scenes: of each task; those are left out whose goal the script of the environment's
         authors does not bring about.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
@@ -137,7 +138,7 @@ def make_weights(args, task, seed):
     bag, runs, ways = Path(args.bags, task), Path(args.runs, task), WAYS.get(task, ())
     world, _, name = task.rpartition('/')
     planned = [method for method in args.methods
-               if method in PLANNED and (seed == 0 or method in LEARNED)]
+               if method in PLANNED and (seed == 0 or method in REPEATED)]
     if not planned:
         return {}
     for pushes, first in BAGS.items():
@@ -266,6 +267,7 @@ def write_results(runs, out, args):
                   'ours': out.resolve() == RESULTS,
                   'legs': last_legs([row for row in rows if row['task'] in SUBGOALS]),
                   'dropped': {method: dropped(rows, method) for method in LEARNED},
+                  'by_training': {method: by_training(rows, method) for method in REPEATED},
                   'more': ahead([row for row in rows if row['task'] in WAYS])}
         template = f'worlds/templates/{page}.md.j2'
         known = Path(__file__).parents[1].joinpath(template).exists()
@@ -285,6 +287,16 @@ def ahead(rows):
             found[other] = '{:+.0f} points ({:+.0f} to {:+.0f})'.format(
                 *mean_interval((both['subgoal'] - both[other]).tolist()))
     return found
+
+
+def by_training(rows, method):
+    """Say how often each training of a method succeeds, if there are several."""
+    found = {}
+    for row in rows:
+        if row['method'] == method:
+            found.setdefault(row['training'], []).append(row['ends'])
+    return ', '.join(f'{np.mean(found[one]):.0%}' for one in sorted(found)) if len(
+        found) > 1 else ''
 
 
 def dropped(rows, method):
@@ -314,7 +326,7 @@ def summarise(rows):
     for (task, method), same in pd.DataFrame(rows).groupby(['task', 'method'], sort=False):
         scenes = same.groupby('seed', sort=False)
         line = {'task': task.rpartition('/')[2], 'method': method, 'scenes': scenes.ngroups,
-                'trainings': same['training'].nunique() if method in LEARNED else None}
+                'trainings': same['training'].nunique() if method in REPEATED else None}
         mean = scenes['ends'].mean()
         line['success'] = share(share_interval(mean.tolist()) if set(mean) <= {0, 1}
                                 else mean_interval(mean.tolist()))

@@ -119,6 +119,7 @@ def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
     page = (tmp_path / 'worlds_loop.md').read_text()
     assert '| push-v3 | random | 2 |' in page and '0% (0 to 66)' in page
     assert '| push-v3 | subgoal | 2 | 2 | 100%' in page
+    assert '**Trainings differ**: subgoal 100%, 100%.' in page
     with pytest.raises(ConfigError, match='dircet unknown'):
         loop.run(replace(args, methods=('dircet',)))
 
