@@ -120,7 +120,7 @@ def test_the_sentences_of_the_readme_are_those_of_the_data():
     ends = wall.groupby('method')['ends'].mean()
     assert ('the predicted subgoals succeed in {:.0%} of {} scenes, and planning directly in '
             '{:.0%}').format(ends['subgoal'], wall['seed'].nunique(), ends['direct']) in text
-    assert 'A fixed time has {:.0%}, not significantly less; one training'.format(
+    assert 'A fixed time has {:.0%}, not significantly less; three trainings'.format(
         ends['fixed time']) in text
     real = json.loads((RESULTS / 'real.json').read_text())['30']
     (error, _, off), (keyframe_error, _, keyframe_off) = (
