@@ -263,9 +263,10 @@ def compare(rows):
     Compare predictors with and without keyframes, over the tasks with several trainings of both.
 
     :return: dict: tasks, how many; hit and near, in words the mean difference in points with its
-        interval over the tasks, whose demonstrations and marks both had; alone, by hit and near
-        those of the tasks that differ by themselves. There intervals are by Newcombe's
-        square-and-add, as if the two had not seen the same demonstrations.
+        interval over the tasks, whose demonstrations and marks both had; error, the mean ratio of
+        errors; alone, by hit and near those of the tasks that differ by themselves. There
+        intervals are by Newcombe's square-and-add, as if the two had not seen the same
+        demonstrations.
     """
     without, shown = ({row['task']: row for row in rows
                    if row['method'] == method and row.get('seeds', 0) > 1}
@@ -279,6 +280,8 @@ def compare(rows):
         found[name] = _in_points(mean_interval([gain.value for gain in gains]))
         alone[name] = [f'{task.rpartition("/")[2]} {_in_points(gain)}'
                   for task, gain in zip(tasks, gains) if gain.low > 0 or gain.high < 0]
+    ratios = [shown[task]['error']['value'] / without[task]['error']['value'] for task in tasks]
+    found['error'] = '{:.2f} ({:.2f} to {:.2f})'.format(*mean_interval(ratios))
     return found | {'alone': alone}
 
 

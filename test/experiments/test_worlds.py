@@ -61,13 +61,15 @@ def test_bottlenecks_are_read_by_their_stamps(tmp_path):
 def test_predictors_with_keyframes_are_compared_over_tasks_of_several_trainings():
     def row(task, method, value, seeds=3):
         share = {'value': value, 'low': value - 0.1, 'high': min(value + 0.1, 1.0)}
-        return {'task': task, 'method': method, 'seeds': seeds, 'hit': share, 'near': share}
+        return {'task': task, 'method': method, 'seeds': seeds, 'hit': share, 'near': share,
+                'error': {'value': 1 - value}}
 
     rows = [row('aside/a/one', 'marks', 0.5), row('aside/a/one', 'keyframes', 0.7),
             row('a/two', 'marks', 0.9), row('a/two', 'keyframes', 0.8),
             row('a/alone', 'marks', 0.1, 1), row('a/alone', 'keyframes', 0.9, 1)]
     found = command.compare(rows)
     assert found['tasks'] == 2 and found['hit'] == found['near'] == '+5 (-10 to +20)'
+    assert found['error'] == '1.30 (0.60 to 2.00)'
     assert found['alone'] == dict.fromkeys(('hit', 'near'), ['one +20 (+6 to +34)'])
     assert command.compare(rows[::2]) == {}
 
