@@ -128,5 +128,5 @@ def test_the_sentences_of_the_readme_are_those_of_the_data():
     right = share_interval(off <= 1 + 1e-3)
     assert (f'In {right.value:.0%} ({100 * right.low:.0f} to {100 * right.high:.0f}) of 40 '
             'held-out demonstrations the predicted moment is within 1 s') in text
-    assert np.mean(keyframe_off <= 1 + 1e-3) >= right.value
+    assert f'without a network, are right in {np.mean(keyframe_off <= 1 + 1e-3):.0%}' in text
     assert f'have {keyframe_error.sum() / error.sum():.1f} times the error' in text
