@@ -90,7 +90,7 @@ def train_and_score(folder, method, seed, out, crop=''):
     from tap_ros.recording.cache import open_recordings
     from tap_ros.recording.marks import read_marks
     import torch
-    path = Path(out, 'scores.json')
+    path = Path(out, 'hits.json')
     if path.exists():
         return json.loads(path.read_text())
     torch.set_num_threads(1)
