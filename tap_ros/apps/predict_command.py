@@ -188,9 +188,10 @@ def fit(picture: np.ndarray, window: Sequence[int], pixels: np.ndarray, predicto
     (left, top, W, H), size = window, predictor.image_size
     full = predictor.camera_crop.is_cut((H, W))
     if not full and not squeezed and W * size[0] != H * size[1]:
+        how = ('say which part of it is used, by --crop centre or --crop LEFT,TOP,SIDE, or '
+               if size[0] == size[1] else 'give pictures of that shape, or ')
         raise ImageError(f'{name}: {W}x{H} pixels (width x height); the weights take pictures of '
-                         f'the shape {size[1]}x{size[0]}; say which part of it is used, by --crop '
-                         'centre or --crop LEFT,TOP,SIDE, or squeeze all of it, by --crop whole')
+                         f'the shape {size[1]}x{size[0]}; {how}squeeze all of it, by --crop whole')
     inside = pixels - np.array([left, top], np.float32)
     if not in_picture(inside, (H, W)).all():
         raise ImageError(

@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 import pytest
 from tap_ros.__main__ import main
+from tap_ros.apps.predict_command import fit
+from tap_ros.base.errors import ImageError
+from tap_ros.prediction.nearest_keyframe import NearestKeyframe
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights.weights import save_weights
@@ -114,3 +117,10 @@ def test_the_part_that_is_used_is_asked_for_or_that_of_the_training(episode, tmp
     assert main(['predict', *map(str, files), '--weights', str(weights), '--out',
                  str(tmp_path / 'out.png')]) == 0
     assert 'on the middle of pictures of 256x144' in capsys.readouterr().err
+
+
+def test_no_square_part_is_asked_for_where_pictures_are_wide():
+    wide = NearestKeyframe.load('bags/sample_push2')
+    wide.image_size = (48, 64)
+    with pytest.raises(ImageError, match='shape 64x48; give pictures of that shape, or squeeze'):
+        fit(np.zeros((30, 30, 3), np.uint8), (0, 0, 30, 30), np.zeros((0, 2)), wide, 'start')
