@@ -59,9 +59,9 @@ class Keyframes:
             self._weights = learned_weights(self._ends, pictures)
         self._pictures = torch.from_numpy(pictures)
         near, _ = nearest(ends, self._ends, NEIGHBOURS + 1, weights=self._weights)
-        own = np.where(kept, kept.cumsum() - 1, -1)[:, None]  # which comes last
-        order = (near == own).argsort(1, kind='stable')[:, :max(1, near.shape[1] - 1)]
-        self._near = np.take_along_axis(near, order, 1)
+        own = np.where(kept, kept.cumsum() - 1, -1)[:, None]  # goes last, and is cut off
+        others = (near == own).argsort(1, kind='stable')[:, :max(1, near.shape[1] - 1)]
+        self._near = np.take_along_axis(near, others, 1)
 
     def draw(self, chosen: np.ndarray, rng: np.random.Generator) -> torch.Tensor:
         """Return uint8 (B, levels, NUM_KEYFRAMES, H, W, 3) of some, the most alike first."""
