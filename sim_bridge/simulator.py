@@ -154,8 +154,10 @@ class Simulator(Table):
                 f'places: expected shape ({task.num_objects}, 2), got {places.shape}')
         limit = getattr(task, 'object_range')  # noqa: B009  # of those that push
         for name, place in zip(self.object_names, places):
-            if not (np.abs(place) <= limit).all():  # not a number is no place either
-                raise SceneError(
-                    f'the goal of {name} is out of reach, at x {place[0]:.3f} m, '
-                    f'y {place[1]:.3f} m; expected within {limit:g} m of the middle, along x '
-                    'and y')
+            if not np.isfinite(place).all():
+                raise SceneError(f'the goal of {name} is not on the table')
+            if far := [f'{max(1, round(100 * (abs(one) - limit)))} cm too far '
+                       f'{less if one < 0 else more}' for one, less, more in zip(
+                           place, ('left', 'forward'), ('right', 'back')) if abs(one) > limit]:
+                raise SceneError(f'the goal of {name} is out of reach: {", ".join(far)}; expected '
+                                 f'at most {100 * limit:g} cm from the middle')

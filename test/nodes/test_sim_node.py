@@ -174,7 +174,7 @@ def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(rig):
     *_, goal = rig.goal(rig.image.wait(10).header.stamp)
     second, count = goal.objects[1], rig.goal_image.count
     for pixels, words in (({'object_1': (256, 120)}, 'object_1.*256.*255.5'),
-                          ({'object_1': (253, 41)}, 'object_1.* out of reach.* 0.35 m')):
+                          ({'object_1': (253, 41)}, 'object_1.* out of reach.* 35 cm')):
         with pytest.raises(CallError, match=words):
             rig.client.set_goal(pixels)
     # Poses do not count: it stays where its pixel is.
