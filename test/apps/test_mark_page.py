@@ -373,6 +373,10 @@ def test_a_hand_that_moves_proposes_nothing_without_labels_and_what_is_marked_st
         page.keyboard.press('n')
         page.wait_for_function('!state.marks[episode]')
         assert page.is_visible('#accept') and page.evaluate('frame') == 3
+        assert page.inner_text('#accept') == 'accept grasp 0.8 s, release 1.5 s (a)'
+        assert page.inner_text('#title').endswith(
+            'proposed: grasp 0.8 s (hand moves; label 1.0 s, confidence 90%), '
+            'release 1.5 s (hand moves; label 1.5 s, confidence 80%)'), 'as the button has it'
         page.evaluate('go(1)')
         page.keyboard.press('1')
         assert page.inner_text('#accept') == 'accept release 1.5 s (a)', 'what is marked stays'

@@ -48,6 +48,13 @@ function accepted() {
   return set.every((t, k) => !k || t > set[k - 1]) ? frames : draft;
 }
 
+// Why a frame is proposed as a mark: what moves there, and the label.
+function reasons(t, k) {
+  return [...about.moves.filter(([at]) => at === t).map(([, closes]) => closes === null ? 'hand moves' : moveOf(closes)),
+    ...labels().slice(k, k + 1).map(([at, sure]) => `label ${second(at)}, confidence ${Math.round(100 * sure)}%`)];
+}
+
+const moveOf = (closes) => closes === null ? 'hand' : `gripper ${closes ? 'closes' : 'opens'}`;
 const added = () => accepted().map((t, k) => [t, k]).filter(([t, k]) => t !== (draft[k] ?? null));
 
 function show(t) {
@@ -74,9 +81,10 @@ function draw() {
   $('busy').textContent = state.busy && count >= LABELLING ? 'finding labels …' : '';
   $('play').textContent = playing ? 'Stop' : 'Play';
   const listed = draft.map((t, k) => t === null ? `${nameOf(k)} not yet` : `${nameOf(k)} ${second(t)}`);
-  const guess = labels().map(([t, sure], k) => `${names()[k] || ''} ${second(t)} (confidence ${Math.round(100 * sure)}%)`);
+  const offer = added(), offered = ([t, k]) => `${nameOf(k)} ${second(t)}`.trim();
+  const guess = offer.map(([t, k]) => `${offered([t, k])} (${reasons(t, k).join('; ')})`);
   $('title').textContent = `Demonstration ${episode} (0 to ${state.lengths.length - 1}): ` +
-    (given().length ? listed.join(', ') + (isSaved() ? '' : ' (not saved)') : 'nothing marked') + (guess.length ? `; label: ${guess.join(', ')}` : '');
+    (given().length ? listed.join(', ') + (isSaved() ? '' : ' (not saved)') : 'nothing marked') + (guess.length ? `; proposed: ${guess.join(', ')}` : '');
   $('file').textContent = `saved ${names().length > 1 ? 'once each name is marked' : 'at once'}, in ${state.file}`;
   drawTicks(last);
   for (const one of $('strip').children) {
@@ -85,7 +93,7 @@ function draw() {
       (inside(frame) ? 'here' : '');
   }
   // The main button is what comes next: to accept, to mark (as Enter does), or the next demonstration.
-  const offer = added(), named = names().length > 0;
+  const named = names().length > 0;
   const wanted = named ? names().length : Object.values(state.marks)[0]?.length || 1;
   const free = offer.length || given().length >= wanted ? -1 : Math.max(0, draft.indexOf(null));
   fill($('names'), named ? names() : ['this moment'], (name, k) => Object.assign(
@@ -95,7 +103,7 @@ function draw() {
   $('next').className = free < 0 && !offer.length ? 'main' : '';
   $('previous').disabled = !seen.length;
   $('accept').hidden = !offer.length;
-  $('accept').textContent = `accept ${offer.map(([t, k]) => `${nameOf(k)} ${second(t)}`.trim()).join(', ')} (a)`;
+  $('accept').textContent = `accept ${offer.map(offered).join(', ')} (a)`;
   fill($('list'), Object.entries(state.marks), ([i, frames]) => made('li', {className: Number(i) === episode ? 'here' : ''},
     button(`${i}: ${state.seconds[i].map((s) => `${s.toFixed(1)} s`).join(', ')}`, () => { visit(Number(i), frames[0]); })));
   if (!count) $('list').append(made('li', {className: 'soft'}, 'What you mark is listed here.'));
@@ -107,7 +115,7 @@ function draw() {
 
 // The ticks of a demonstration: [frame, kind, text]; a label until its mark is there.
 function ticks() {
-  return [...about.moves.map(([t, closes]) => [t, 'move', closes === null ? 'hand' : `gripper ${closes ? 'closes' : 'opens'}`]),
+  return [...about.moves.map(([t, closes]) => [t, 'move', moveOf(closes)]),
     ...labels().map(([t], k) => [t, 'label', `${names()[k] || 'label'}?`]).filter((_, k) => (draft[k] ?? null) === null),
     ...draft.flatMap((t, k) => t === null ? [] : [[t, isSaved() ? 'mark' : 'draft', nameOf(k)]])];
 }
