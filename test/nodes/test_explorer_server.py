@@ -8,6 +8,7 @@ import json
 import math
 import socket
 import threading
+import time
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 from sensor_msgs.msg import CompressedImage, Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.apps.explorer import command as explore
+from tap_ros.apps.explorer import node as explorer_node
 from tap_ros.apps.explorer.browser_commands import CommandError, parse_command
 from tap_ros.apps.explorer.display import GoalByHand
 from tap_ros.apps.explorer.node import ExplorerNode
@@ -257,6 +259,27 @@ def test_a_photograph_of_a_real_camera_becomes_the_goal(transport):
         goal = goal_image.wait(10)
         assert bytes(goal.data) == image.tobytes() and goal.header == message.header
         assert not goal_objects.wait(10).objects, 'not those of another goal'
+
+
+def test_what_is_sent_again_and_again_is_encoded_once_and_plugins_are_looked_for_once(monkeypatch):
+    made = []
+    for name in ('picture_bytes', 'names'):
+        asked = getattr(explorer_node, name)
+        monkeypatch.setattr(explorer_node, name, lambda *what, name=name, asked=asked: (
+            made.append(name), asked(*what))[1])
+    explorer = LocalNode(ExplorerNode, port=0)
+    picture = encode_image(np.zeros((12, 16, 3), np.uint8), to_stamp(5), CAMERA_FRAME)
+    with Client('camera') as node, browse(explorer.node._server):
+        publisher = node.create_publisher(Image, 'camera/image_raw', STREAM)
+        assert until(publisher.get_subscription_count)
+        for count, stamp in enumerate((5, 6), 1):
+            picture.header.stamp = to_stamp(stamp)
+            for _ in range(10):
+                publisher.publish(picture)
+                time.sleep(0.1)
+            assert until(lambda count=count: made.count('picture_bytes') == count)
+    assert explorer.end() == 0
+    assert sorted(made) == ['names', 'picture_bytes', 'picture_bytes']
 
 
 def test_goals_placed_by_hand_leave_the_others_and_belong_to_their_picture():

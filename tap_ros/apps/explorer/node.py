@@ -56,6 +56,7 @@ class ExplorerNode(Node):
         self._display = display.Display(self)
         self._changed: set[str] = set()  # kinds whose newest message was not shown yet
         self._states = NodeStates()
+        self._tasks = names('tap_ros.tasks')  # once: it reads files of all installed packages
         self._task = self.params['task']
         self._seed: int | None = None  # of the scene, once it is told
         self._scenes = 0  # that have begun
@@ -123,7 +124,8 @@ class ExplorerNode(Node):
                 if name == 'goal_objects' and before and _places(before) != _places(message):
                     self._calls.forget_end()  # of a goal that somebody has moved since
                 newest[name] = message, reception_time(info)
-                self._changed.add(name)
+                if message != before:  # one that is sent again is shown already
+                    self._changed.add(name)
         return AdaptiveSubscription(self, kind, topic, keep, qos)
 
     def _forget(self, *kinds: str) -> None:
@@ -200,7 +202,7 @@ class ExplorerNode(Node):
         now, simulator, tracker = (
             time.monotonic(), calls.offered('reset'), calls.offered('select'))
         self._server.put('state', json.dumps({
-            'kind': 'state', 'tasks': names('tap_ros.tasks'), 'task': self._task,
+            'kind': 'state', 'tasks': self._tasks, 'task': self._task,
             'seed': self._seed, 'scene': self._scenes, 'simulator': simulator, 'tracker': tracker,
             'predictor': calls.offered('predict'), 'planner': calls.offered('cancel'),
             'plans': not simulator or not display.grips(self._task),
