@@ -160,13 +160,18 @@ def test_what_cannot_be_done_is_said_moves_nothing_and_is_no_error_of_a_node(exp
         reset(page)
         first, second = state(page)['goal']['objects']
         before = page.locator('#subgoal-run').bounding_box()
-        drag(page, first['name'], second['u'], second['v'])
-        page.wait_for_selector('#error:not(:empty)')
-        said = page.inner_text('#error')
-        assert said.startswith('the goal was not moved: ') and '/' not in said, 'in words'
-        assert page.locator('#subgoal-run').bounding_box() == before, 'nothing moves'
-        assert state(page)['goal']['objects'] == [first, second]
-        assert page.evaluate('moved') is None
+        for place, why in (
+                ((second['u'], second['v']), f'{second["name"]}.* would overlap'),
+                ((5, 5), r'out of reach: \d+ cm too far left, \d+ cm too far back; .* 35 cm'),
+                ((-9, 90), 'would be outside the picture')):
+            problems = state(page)['problem']['count']
+            drag(page, first['name'], *place)
+            page.wait_for_function(f'state.problem.count > {problems}')
+            said = page.inner_text('#error')
+            assert re.match(f'the goal was not moved: .*{why}', said) and '/' not in said
+            assert page.locator('#subgoal-run').bounding_box() == before, 'nothing moves'
+            assert state(page)['goal']['objects'] == [first, second]
+            assert page.evaluate('moved') is None
         page.click('#direct')
         page.wait_for_function(r'/step \d+ of at most 80,/.test(state.run.stage)', timeout=120_000)
         page.click('#cancel')

@@ -32,6 +32,9 @@ OUTLINE, TURNED = ((-9.0, -9.0), (9.0, -9.0), (0.0, 9.0)), ((9.0, -9.0), (9.0, 9
 LIVE = """() => [...document.querySelectorAll('button:enabled')].filter(
     (one) => one.offsetParent && !one.closest('h2')).map((one) => one.id)"""
 
+WHOLE = """(selector) => [...document.querySelectorAll(selector)].every((one) =>
+    one.scrollHeight <= one.clientHeight && one.scrollWidth <= one.clientWidth)"""
+
 
 class Camera:
     """A camera, and a tracker of another make."""
@@ -111,6 +114,8 @@ def test_each_step_is_in_sight_says_what_it_waits_for_and_offers_nothing_too_ear
             assert 'will be here' in page.inner_text('#empty')
         page.check('#view-camera', force=True)
         assert not hidden_or_over(page, 'header', '#stage', '#said', '#views', '#steps')
+        assert 'what to reach: step 3' in page.inner_text('#views')
+        assert page.evaluate(WHOLE, '#views label, #views small')
         with Client('camera') as node:
             camera = Camera(node)
             page.wait_for_function('pictures.camera && state.tracker && state.camera.width')
@@ -217,6 +222,19 @@ def test_a_subgoal_says_what_it_is_undecided_about_and_goes_when_others_are_foll
                 page.wait_for_function('pictures.subgoal && state.subgoal')
                 assert says(page, 'predict') == 'undecided about object_0'
                 page.evaluate("look('camera')")
+
+
+@pytest.mark.parametrize('size', [DESK, PHONE])
+def test_what_happened_and_what_went_wrong_can_be_read_whole(explorer, browser, size):
+    with opened(browser, explorer.node.url, size) as page:
+        page.wait_for_function('state')
+        for k in range(9):
+            explorer.node._display.events.add(f'{k}: {60 * "words "}', problem=True)
+        page.wait_for_function("events.length === 9 && $('error').textContent.startsWith('8: ')")
+        assert page.evaluate(WHOLE, '#said, #log p') and page.locator('#log p').count() == 9
+        page.locator('#log p').last.scroll_into_view_if_needed()
+        assert page.locator('#log p').last.bounding_box()['y'] < size[1]
+        assert not hidden_or_over(page, '#log')
 
 
 def test_beside_a_camera_alone_the_page_says_what_to_start(explorer, browser):

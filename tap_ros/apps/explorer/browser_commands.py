@@ -247,16 +247,22 @@ class ExplorerCalls:
         truth = display.places('true_goals') or goals
         their = simulated(goals, truth, display.size('goal')['width']) if (
             self.offered('set_goal')) else {}
+        size, to = display.size('goal' if 'goal' in display.newest else 'camera'), (u, v)
         if name in their:
             du, dv = (there - here for there, here in zip(truth[their[name]], goals[name]))
+            to = u + du, v + dv
+        if size['width'] and not all(-0.5 <= one <= most - 0.5
+                                     for one, most in zip(to, size.values())):
+            raise CallError(f'{escaped(name)} would be outside the picture')
+        if name in their:
             try:
-                self._client.set_goal({their[name]: (u + du, v + dv)})
+                self._client.set_goal({their[name]: to})
             except CallError as error:
                 raise CallError(renamed(str(error), dict.fromkeys(
                     truth, 'an object that is not followed') | {
                         each: here for here, each in their.items()})) from error
         else:
-            self._by_hand.place(name, (u, v), {
+            self._by_hand.place(name, to, {
                 kind: message for kind, (message, _) in display.newest.copy().items()})
         display.events.add(f'goal: {escaped(name)} to pixel {u:.0f}, {v:.0f}', 'goal')
 

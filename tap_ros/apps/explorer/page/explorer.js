@@ -6,7 +6,6 @@
 
 const RECONNECT_MS = 1000;
 const SEARCH_MS = 4000;  // that the tracker may take for a goal picture
-const LONG = 70;  // letters of an event that need a wide place
 const STEPS = ['scene', 'objects', 'goal', 'predict', 'go'];
 const VIEW = {scene: 'camera', objects: 'camera', goal: 'goal', predict: 'goal', go: 'subgoal'};  // which a step begins with
 
@@ -223,11 +222,11 @@ function hint() {
 
 function showEvents() {
   if (!events.length) return;
-  fill($('log'), [...events].reverse(), ({text, time, picture, problem}) => made('li', {className: picture && text.length < LONG ? '' : 'wide', title: text},
+  fill($('log'), [...events].reverse(), ({text, time, picture, problem}) => made('li', {},
     ...picture ? [made('img', {src: picture, alt: ''})] : [],
-    made('time', {textContent: new Date(1000 * time).toLocaleTimeString()}),
-    made('div', {className: problem ? 'bad' : '', textContent: text, tabIndex: -1})));
-  $('log').scrollLeft = 0;
+    made('div', {}, made('time', {textContent: new Date(1000 * time).toLocaleTimeString()}),
+      made('p', {className: problem ? 'bad' : '', textContent: text}))));
+  $('log').scrollTop = 0;
 }
 
 // Buttons and keys
@@ -277,6 +276,6 @@ document.addEventListener('keydown', (event) => {
   }
 });
 
-$('log').append(made('li', {className: 'wide soft'}, 'Nothing yet: each step leaves its time, its words and a picture here.'));
+$('log').append(made('li', {className: 'soft'}, 'Nothing yet: each step leaves its time, its words and a picture here.'));
 for (const one of document.querySelectorAll('#side .row button')) one.disabled = true;
 connect();

@@ -9,13 +9,13 @@ const STATE_COLOURS = {seen: '#2fbf5b', hidden: '#9aa6b8', unsure: '#ff9f1c', lo
 const SHARP = 1024;  // least width (px) to which a picture is drawn, each pixel a square
 const SMALL = 96;  // px, of the switches
 const VIEWS = {  // kind: [name, what is said without a picture: small, large]
-  camera: ['now', 'no picture', 'What the camera sees will be here, once it sends a picture.'],
-  goal: ['goal', 'step 3', 'The goal picture will be here: what the table is to look like.'],
-  subgoal: ['subgoal', 'step 4', 'The predicted subgoal will be here, after step 4: the picture in '
+  camera: ['now', 'what the camera sees', 'What the camera sees will be here, once it sends a picture.'],
+  goal: ['goal', 'what to reach: step 3', 'The goal picture will be here: what the table is to look like.'],
+  subgoal: ['subgoal', 'what comes between: step 4', 'The predicted subgoal will be here, after step 4: the picture in '
     + 'between, in which objects of step 2 glow where they are expected.'],
-  plan: ['plan', 'step 5', 'The newest plan will be here, once the arm moves: the paths that were '
+  plan: ['plan', 'paths of the hand: step 5', 'The newest plan will be here, once the arm moves: the paths that were '
     + 'considered, and the one that was chosen.'],
-  observer: ['arm', 'no picture', 'The whole arm will be here, as the camera would see it.']};
+  observer: ['arm', 'the whole arm', 'The whole arm will be here, as the camera would see it.']};
 
 let state = null;
 const pictures = {};  // kind -> ImageBitmap
