@@ -131,6 +131,8 @@ def test_an_object_that_is_dragged_is_brought_there_via_a_subgoal(explored, brow
         assert page.evaluate('missingGoals().length') == 0
         assert explored.away() > SUCCESS_DISTANCE
         page.click('#subgoal-run')
+        page.wait_for_function('state.run.to_subgoal && state.camera.targets.length === 2'
+                               " && /by the subgoal/.test($('hint').textContent)", timeout=120_000)
         page.wait_for_function('pictures.subgoal && pictures.plan', timeout=120_000)
     with opened(browser, explored.url) as page:  # who closes the page stops nothing
         page.wait_for_function('!state.run.running', timeout=240_000)

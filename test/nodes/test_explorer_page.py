@@ -222,6 +222,17 @@ def test_a_subgoal_says_what_it_is_undecided_about_and_goes_when_others_are_foll
                 page.wait_for_function('pictures.subgoal && state.subgoal')
                 assert says(page, 'predict') == 'undecided about object_0'
                 page.evaluate("look('camera')")
+                calls = explorer.node._calls
+                calls._asked = calls.to_subgoal = True  # as a goal does that is under way
+                page.wait_for_function('state.camera.targets.length')
+                target, = page.evaluate('state.camera.targets')
+                assert target == {'name': 'object_0', 'u': 30.0, 'v': 30.0}
+                assert 'Crosses: where they go first, by the subgoal.' in page.inner_text('#hint')
+                calls.to_subgoal = False
+                page.wait_for_function('!state.run.to_subgoal && !state.camera.targets.length')
+                assert 'subgoal' not in page.inner_text('#hint')
+                calls._asked = False
+                page.wait_for_function('!state.run.running')
 
 
 @pytest.mark.parametrize('size', [DESK, PHONE])

@@ -97,6 +97,7 @@ class ExplorerCalls:
     :param on_selected: called when other objects are followed.
     :ivar end: how the last goal of a browser ended, in words; whether it was reached, or stopped
         because its steps were spent.
+    :ivar to_subgoal: whether it is under way, to its subgoal.
     """
 
     def __init__(self, node: Node, display: Display, on_error: Callable[[str], object],
@@ -110,6 +111,7 @@ class ExplorerCalls:
         self._asked = self._cancelled = self._ending = False  # asked: by a browser, for a goal
         self._ours = False  # the goal under way was asked for by a browser
         self._stage, self._most = '', 0  # most steps of the goal
+        self.to_subgoal = False
         self.forget_end()
         self._under_way = False  # a goal, whoever sent it
         self._planner: Presence | None = None  # that said so
@@ -207,6 +209,7 @@ class ExplorerCalls:
             if do == 'reach':
                 with self._lock:
                     self._asked, self._goal, self._stage = False, None, ''
+                    self.to_subgoal = False
                     self._forget_goal()
 
     def _call(self, service: str, **fields: Any) -> Any:
@@ -307,6 +310,7 @@ class ExplorerCalls:
         self._display.events.add(end)
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
+        self.to_subgoal = feedback.stage.startswith('subgoal')
         self._stage = (
             f'step {feedback.step} of at most {self._most}, to the {escaped(feedback.stage, 60)}, '
             f'plan in {feedback.planning_ms:.0f} ms with {feedback.plan_samples} samples')

@@ -101,6 +101,18 @@ class Display:
         names = listing(compress(message.object_names, undecided))
         return f'undecided about {names}' if names else 'the subgoal is there'
 
+    def expected(self) -> dict[str, Place]:
+        """Return where the newest subgoal expects objects; empty if not in the camera's pixels."""
+        message, _ = self.newest.get('subgoal', (Subgoal(), 0.0))
+        if (message.image.width, message.image.height) != self.sizes.get('camera'):
+            return {}  # of a part of the picture
+        try:
+            pixels = decode_subgoal(message, message.object_names).expected_pixels
+            return {name: (u, v) for name, (u, v) in zip(message.object_names, pixels.tolist())}
+        except TapError as error:
+            self.warn(error)
+            return {}
+
     def size(self, kind: str) -> dict[str, int]:
         """Return width and height of the newest picture of a kind; 0 without one."""
         return dict(zip(('width', 'height'), self.sizes.get(kind, (0, 0))))

@@ -199,6 +199,7 @@ class ExplorerNode(Node):
         if 'subgoal' in changed:
             self._subgoal = shown.subgoal()
         objects, goals = shown.places('objects'), shown.places('goal_objects')
+        targets = shown.expected() if running and calls.to_subgoal else goals
         now, simulator, tracker = (
             time.monotonic(), calls.offered('reset'), calls.offered('select'))
         self._server.put('state', json.dumps({
@@ -212,7 +213,8 @@ class ExplorerNode(Node):
             'camera': {**shown.size('camera'),
                        'objects': display.listed(
                            objects, newest.get('objects', [None])[0], shown.outlines.copy()),
-                       'targets': display.listed({n: goals[n] for n in objects if n in goals}),
+                       'targets': display.listed(
+                           {each: targets[each] for each in objects if each in targets}),
                        'note': display.silence(now, newest.get('camera')),
                        'objects_note': display.silence(now, newest.get('objects'))},
             'subgoal': self._subgoal, 'passed': self._passed and not running,
@@ -220,7 +222,8 @@ class ExplorerNode(Node):
                      'objects': display.listed(goals, newest.get('goal_objects', [None])[0]),
                      'pictured': 'goal' in newest},
             'problem': shown.events.problem, 'events': shown.events.count,
-            'run': {'running': running, 'stage': stage, **calls.end},
+            'run': {'running': running, 'stage': stage, 'to_subgoal': calls.to_subgoal,
+                    **calls.end},
             'nodes': self._states.lines(now, self._present, tracker)}))
 
     def _present(self) -> set[str]:

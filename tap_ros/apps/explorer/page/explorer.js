@@ -210,6 +210,7 @@ function hint() {
   const missing = missingGoals(), moves = movable(), undecided = state.subgoal.startsWith('undecided');
   return {
     camera: untracked() ? 'Start tracker_node to click on objects here.'
+      : state.run.to_subgoal ? `Outlines: where objects are. ${state.camera.targets.length ? 'Crosses: where they go first, by the subgoal.' : 'They go to the subgoal first.'}`
       : state.run.reached && moves ? `Reached. Drag ${state.movable === 'goal' ? 'goals in the goal picture' : 'objects'} elsewhere and go again, or choose another scene or other objects.` : `Outlines: where objects are. Crosses: where they should be${moves ? '; drag one elsewhere to change the goal.' : '.'}`,
     goal: missing.length && searching() ? `Looking for ${missing.join(', ')} in this picture.`
       : moves && missing.length ? `${missing.every((name) => state.goal.objects.some((one) => one.name === name)) ? 'Not found in this picture' : 'No goal known yet for'}: ${missing.join(', ')}. Drag each to its place here.`
