@@ -162,6 +162,7 @@ def test_what_cannot_be_done_is_said_moves_nothing_and_is_no_error_of_a_node(exp
         reset(page)
         first, second = state(page)['goal']['objects']
         before = page.locator('#subgoal-run').bounding_box()
+        assert page.locator('#step-go button.main').get_attribute('id') == 'subgoal-run'
         for place, why in (
                 ((second['u'], second['v']), f'{second["name"]}.* would overlap'),
                 ((5, 5), r'out of reach: \d+ cm too far left, \d+ cm too far back; .* 35 cm'),
@@ -180,6 +181,8 @@ def test_what_cannot_be_done_is_said_moves_nothing_and_is_no_error_of_a_node(exp
         page.wait_for_function('!state.run.running')
         assert 'cancelled' in newest(page)
         assert page.is_enabled('#cancel') and page.is_enabled('#direct')
+        page.wait_for_function("$('direct').matches('.main:enabled')")
+        assert page.locator('#step-go button.main').count() == 1, 'what was done last'
         page.click('#cancel')
         page.wait_for_function("/nothing is in progress/.test($('error').textContent)")
         assert not [each for each in state(page)['nodes'] if each['state'] == 'wrong']

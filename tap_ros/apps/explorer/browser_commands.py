@@ -96,7 +96,7 @@ class ExplorerCalls:
     :param on_error: called with what went wrong for which nobody but us is to blame.
     :param on_selected: called when other objects are followed.
     :ivar end: how the last goal of a browser ended, in words; whether it was reached, or stopped
-        because its steps were spent.
+        because its steps were spent; its mode, '' without one.
     :ivar to_subgoal: whether it is under way, to its subgoal.
     """
 
@@ -137,9 +137,11 @@ class ExplorerCalls:
             'cancelling' if self._cancelled else self._stage or (
                 'ending' if self._ours else "another client's goal"))
 
-    def forget_end(self, said: str = '', reached: bool = False, spent: bool = False) -> None:
+    def forget_end(self, said: str = '', reached: bool = False, spent: bool = False,
+                   mode: str = '') -> None:
         """Forget how the last goal ended: there is another one, or it ended in another way."""
-        self.end: dict[str, Any] = {'end': said, 'reached': reached, 'spent': spent}
+        self.end: dict[str, Any] = {
+            'end': said, 'reached': reached, 'spent': spent, 'mode': mode}
 
     def do(self, text: str | bytes) -> None:
         """
@@ -200,7 +202,7 @@ class ExplorerCalls:
                 said = f'{REFUSED[do]}: {plain(text)}'
                 self._display.events.add(said, problem=True)
                 if do == 'reach':
-                    self.forget_end(said)
+                    self.forget_end(said, **fields)
                 if isinstance(error, TapError):
                     self._node.get_logger().info(f'{do}: {text}')
                 else:
@@ -306,7 +308,7 @@ class ExplorerCalls:
         end = 'cancelled' if result.end == 'cancelled' else plain(escaped(result.message, 1000))
         spent = result.end == 'succeeded' and not result.success
         end = f'{words}: {end}' + ('' if spent else f' ({result.steps} steps)')
-        self.forget_end(end, result.success, spent)
+        self.forget_end(end, result.success, spent, mode)
         self._display.events.add(end)
 
     def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:

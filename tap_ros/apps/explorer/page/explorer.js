@@ -160,6 +160,8 @@ function showState() {
   allow('predict', busy || done.predict[2]);
   allow('direct', busy || done.go[2], 'to the goal at once');
   allow('subgoal-run', busy || done.go[2] || done.predict[2], 'first to a predicted subgoal');
+  $('subgoal-run').classList.toggle('main', run.mode !== 'direct');  // main is what was done last
+  $('direct').classList.toggle('main', run.mode === 'direct');
   $('subgoal-run').textContent = `go ${run.spent ? 'on ' : ''}via the subgoal`;
   $('direct').textContent = `go ${run.spent ? 'on ' : ''}directly`;
   $('scene').hidden = !state.simulator;
