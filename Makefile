@@ -32,8 +32,9 @@ help:
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; JOBS=4, ARGS=--list'
 	@echo 'make worlds  demonstrations of other simulators, and who finds their bottlenecks; goes on'
-	@echo 'make faults  inject every fault into real nodes and disks, in docs/results; takes long;'
-	@echo '             ARGS="-k silent": only those; ARGS="--share 0.1": a tenth of the trials'
+	@echo 'make faults  inject every fault into real nodes and disks, in runs/faults; takes long;'
+	@echo '             ARGS="-k silent": only those; ARGS="--share 0.1": a tenth of the trials;'
+	@echo '             REPORT=docs/results: make its page anew'
 	@echo 'make bench   measure the speed of what this version has not measured; ARGS=...'
 	@echo 'make lint    check the style of the code and its types'
 	@echo 'make build   only the set-up: .venv, install/; then, to work in it:'
@@ -68,7 +69,7 @@ worlds: build
 	@$(ENTER); python -m experiments worlds --jobs $(or $(JOBS),2) --out docs/results $(ARGS)
 
 faults: build
-	@$(ENTER); $(DOMAIN); python -m pytest -m fault --share 1 --report docs/results test/faults $(ARGS)
+	@$(ENTER); $(DOMAIN); python -m pytest -m fault --share 1 --report $(or $(REPORT),runs/faults) test/faults $(ARGS)
 
 bench: build
 	@$(ENTER); $(DOMAIN); python -m experiments bench $(or $(ARGS),all)
@@ -93,8 +94,12 @@ build: .venv/build.done
 	@touch $@
 
 # In the environment of `make build`; apart from it, so that nothing else depends on it.
-ros2: build
+ros2: build ros2/done
+	@:
+
+ros2/done: scripts/ros2.bash requirements-ros2.txt | build
 	@scripts/ros2.bash
+	@touch $@
 
 clean:
 	rm -rf .venv build install log ros2

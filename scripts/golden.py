@@ -210,7 +210,7 @@ def main(options):
         return 0
     if name not in known:
         print(f'{name}: no digests are known; write them with --write on a commit to compare with')
-        return 0
+        return 2
     before = known[name]
     differ = [what for what in before if before[what] != found.get(what)]
     print('\n'.join([f'not known here: {what}' for what in found if what not in before]

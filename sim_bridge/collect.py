@@ -28,7 +28,7 @@ from tap_ros.base.files import only_writer, storage_errors, write_atomically
 from tap_ros.base.options import Folder, one_of
 from tap_ros.base.plugins import names
 from tap_ros.base.progress import Progress
-from tap_ros.base.text import escaped
+from tap_ros.base.text import counted, escaped
 from tap_ros.recording.writer import count_episodes, EpisodeWriter, write_metadata
 from tap_ros.robots.arm import DEFAULT_ARM
 
@@ -99,7 +99,7 @@ def run(args: Options) -> None:
     if not result['episodes']:
         print(f'{args.out}: all {args.recording.episodes} episodes were there already')
         return
-    print(f"{args.out}: {result['episodes']} episodes, {result['frames']} frames in "
+    print(f"{args.out}: {counted(result['episodes'], 'episode')}, {result['frames']} frames in "
           f"{result['seconds']['wall']:.0f} s; objects end "
           f"{100 * result['mean_final_distance']:.1f} cm from their goals on average, "
           f"{result['success_rate']:.0%} of the episodes succeed")

@@ -15,4 +15,6 @@ ROOT = Path(__file__).parents[1]
 def test_digests_are_as_before():
     run = subprocess.run([sys.executable, ROOT / 'scripts' / 'golden.py'], cwd=ROOT, text=True,
                          capture_output=True)
+    if run.returncode == 2:
+        pytest.skip(run.stdout.splitlines()[-1])
     assert run.returncode == 0, run.stdout[-3000:] + run.stderr[-3000:]

@@ -64,7 +64,18 @@ def main(line: CommandLine, arguments: Sequence[str] | None = None) -> int:
     :raises SystemExit: with code 2 for words that are no command or option, which are printed;
         with code 0 after --help.
     """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        try:
+            return _main(line, sys.argv[1:] if arguments is None else list(arguments))
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
+        return 1
+
+
+def _main(line: CommandLine, arguments: Sequence[str]) -> int:
+    """Run one command; a pipe that nobody reads is left to the caller."""
     if arguments == ['--version']:
         print(f'tap_ros {VERSION}')
         return 0
@@ -81,9 +92,8 @@ def main(line: CommandLine, arguments: Sequence[str] | None = None) -> int:
         if error.name not in EXTRAS:
             raise
         message = f'{error.name} is not installed; type `pip install {EXTRAS[error.name]}`'
-    except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
-        return 1
+    except BrokenPipeError:
+        raise
     except OSError as error:
         place = f'{escaped(error.filename)}: ' if error.filename else ''
         message = (f'{place}{escaped(error.strerror or error)}; see whether the place is there, '

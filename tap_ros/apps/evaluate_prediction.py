@@ -12,7 +12,7 @@ import numpy as np
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import Bags, File, Flag, Folder, Topic
-from tap_ros.base.text import listing
+from tap_ros.base.text import counted, listing
 from tap_ros.evaluation.full_size import Answer, answer_at_full_size
 from tap_ros.evaluation.hits import score_hits, seconds_off
 from tap_ros.evaluation.intervals import against_copying, Interval, mean_interval, share_interval
@@ -207,7 +207,7 @@ def _answer_large(network: PredictorNetwork | Predictor, training: dict[str, Any
         word, ratio = against_copying(*(np.array([getattr(one, name) for one in answers])
                                         for name in ('l1', 'copying')))
         height, width = answers[0].pictures[0].shape[:2]
-        print(f'at {width}x{height} pixels, {len(answers)} episodes: {word}; error '
+        print(f'at {width}x{height} pixels, {counted(len(answers), "episode")}: {word}; error '
               f'{np.mean([one.l1 for one in answers]):.4f}, {ratio.value:.2f} times copying '
               f'({ratio.low:.2f}, {ratio.high:.2f})')
     return answers
@@ -250,16 +250,17 @@ def _print_table(scores: Mapping[str, EpisodeScores], goal_picture: str,
                  sources: Iterable[str]) -> None:
     """Print what was scored, and a line for each metric, a column for each method."""
     count = len(scores['prediction'].min_l1)
-    print(f'{count} episode{"s" if count > 1 else ""}, goal picture: {goal_picture}; l1 on [0, 1];'
+    print(f'{counted(count, "episode")}, goal picture: {goal_picture}; l1 on [0, 1];'
           + ''.join(f' object positions: {source.replace("_", " ")};'
                     for source in sorted(sources))
           + ' in brackets 95% intervals over the episodes')
     columns = {method: value.intervals() for method, value in scores.items()}
-    print(f'{"":20s}' + ''.join(f'{method:>28s}' for method in columns))
+    width = max(map(len, _SHOWN))
+    print(' ' * width + ''.join(f'{method:>27s}' for method in columns))
     for name in _SHOWN:
         if name in columns['prediction']:
-            print(f'{name:20s}' + ''.join(
-                f'{_text(column[name]) if name in column else "-":>28s}'
+            print(f'{name:{width}s}' + ''.join(
+                f'{_text(column[name]) if name in column else "-":>27s}'
                 for column in columns.values()))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from tap_ros.base.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File
-from tap_ros.base.text import escaped, listing
+from tap_ros.base.text import counted, escaped, listing
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import film_strip, grid, png_bytes
 from tap_ros.recording.bags import find_bags, list_topics
@@ -66,7 +66,7 @@ def run(args: Options) -> None:
     store = open_recordings(bags, reading=reading, network='the predictor')
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
-    print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
+    print(f'{escaped(args.path)}: {counted(len(episodes), "episode")}, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     if store.camera_size not in (store.image_size, None):
         print('cut         from pictures of {1}x{0} pixels'.format(*store.camera_size))
@@ -93,7 +93,8 @@ def run(args: Options) -> None:
         print(f'picture     {escaped(args.picture)}')
     check_trainable(store.image_size, 'the predictor')
     training, held_out = split_episodes(store, args.test_fraction)
-    print(f'train       {len(training)} episodes to learn from, {len(held_out)} held out')
+    print(f'train       {counted(len(training), "episode")} to learn from, {len(held_out)} held '
+          'out')
     warn_if_few(held_out)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File, Folder
 from tap_ros.base.progress import Progress
-from tap_ros.base.text import escaped, listing
+from tap_ros.base.text import counted, escaped, listing
 from tap_ros.evaluation.intervals import share_interval
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.bags import find_bags, Paths
@@ -113,7 +113,8 @@ def run(options: Options) -> None:
     write_atomically(out / 'labels.csv', to_csv(rows))
     frames = {i: those for i in range(len(store)) if (
         those := marks.episodes.get(i) or frames_of(store, i, labels.moments[i]))}
-    write_marks(out / 'labels.marks.json', store, options.recordings, frames, names)
+    write_marks(out / 'labels.marks.json', store, options.recordings, frames, names,
+                frames.keys() - marks.episodes.keys())
     write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
     parts = segment_names(names)
     for source, name in distinct_names(store).items():
@@ -127,13 +128,14 @@ def run(options: Options) -> None:
             numbers[i]: Ends(labels.moments[i].tolist(), float(store.seconds(i)[-1]),
                              float(np.diff(store.seconds(i)).max())) for i in frames})
         print(f'{options.write_lerobot}: {count} rows with the subtasks {listing(parts)}' + (
-            f'; {missing} demonstrations without labels are {UNLABELLED}' if missing else ''))
+            f'; {counted(missing, "demonstration")} without labels: {UNLABELLED}'
+            if missing else ''))
         if (version := str(known.get('codebase_version'))).startswith('v2'):
             print(f'{options.write_lerobot}: is of {escaped(version, 20)}, and lerobot shows the '
-                  'subtasks of v3.0; convert it, then write them again: the conversion leaves '
-                  'their names out')
-    print(f'{out}: {len(store)} demonstrations labelled; look at labels.png: numbers cannot tell '
-          'whether all marks are early or late')
+                  'subtasks of v3.0 only; convert it with the package lerobot, then run this '
+                  'again: the conversion leaves the subtasks out')
+    print(f'{out}: {counted(len(store), "demonstration")} labelled; look at labels.png: '
+          'numbers cannot tell whether all marks are early or late')
 
 
 def describe_all(recordings: Paths, reading: Reading,

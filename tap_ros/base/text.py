@@ -34,6 +34,11 @@ def listing(names: Iterable[object], limit: int = 8) -> str:
     return shown if len(names) <= limit else f'{shown} and {len(names) - limit} more'
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, such as '1 episode' or '2 episodes'."""
+    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+
+
 def meant(name: str, valid: Iterable[str]) -> str:
     """Return "did you mean 'the nearest'? " of valid names; '' where none is near."""
     near = get_close_matches(name, valid, 1)

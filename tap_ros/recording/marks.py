@@ -13,10 +13,11 @@ and so can a person:
 
 A recording is a path from the folder of the file; its episodes count from 0. Stamps are seconds,
 of the camera's messages: one a mark, in order of time, or [first, last] of a mark that lasts.
-Before "marks" there may be the names of an episode's marks: "names": ["grasp", "release"].
+Before "marks" there may be the names of an episode's marks: "names": ["grasp", "release"]. An
+entry with "label": true was not marked by a person, but labelled by `python -m tap_ros label`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import hashlib
 import json
@@ -46,11 +47,13 @@ class Marks:
     :param episodes: index of an episode: its marks, in order of time.
     :param digest: SHA-256 of the file that they come from.
     :param names: of the marks of each episode, in order; () where they have none.
+    :param labels: the episodes that `label` labelled, and nobody marked.
     """
 
     episodes: Mapping[int, Sequence[Mark]]
     digest: str
     names: tuple[str, ...] = ()
+    labels: frozenset[int] = frozenset()
 
     def number(self, name: str, episodes: Iterable[int]) -> int:
         """
@@ -93,7 +96,8 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
         data = read_bytes(path, _MOST_BYTES)
         content = parse_json(data)
         entries, names = content['marks'], content.get('names', [])
-        found = [(entry['recording'], entry['episode'], entry['stamps']) for entry in entries]
+        found = [(entry['recording'], entry['episode'], entry['stamps'], entry.get('label'))
+                 for entry in entries]
         if not isinstance(names, list) or not all(
                 isinstance(name, str) and name for name in names) or len({*names}) < len(names):
             raise ConfigError(f'{name}: "names" are not usable; expected a list of different ones,'
@@ -105,20 +109,22 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
             f'{name}: {error.strerror}; make it by `python -m tap_ros mark`') from error
     except RecordingError as error:
         raise ConfigError(str(error)) from error
-    except (LookupError, TypeError, ValueError) as error:
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
         raise ConfigError(f'{name}: is no file of marks; expected {{"marks": [{{"recording": '
                           '"door", "episode": 0, "stamps": [13.25]}]}, with seconds') from error
     episodes: dict[int, Sequence[Mark]] = {}
-    for number, (recording, episode, stamps) in enumerate(found, start=1):
+    labels = set()
+    for number, (recording, episode, stamps, label) in enumerate(found, start=1):
         try:
             i = _episode(store, Path(path).parent, recording, episode)
             if i in episodes:
                 raise ValueError('its episode is marked above; put all its stamps in one entry')
             episodes[i] = _frames(store[i].stamps, stamps)
+            labels |= {i} if label is True else set()
         except (TypeError, ValueError, OverflowError, RuntimeError, OSError) as error:
             raise ConfigError(f'{name}: mark {number} (recording {escaped(recording, 60)}, episode'
                               f' {escaped(episode, 20)}): {error}') from error
-    return Marks(episodes, hashlib.sha256(data).hexdigest(), tuple(names))
+    return Marks(episodes, hashlib.sha256(data).hexdigest(), tuple(names), frozenset(labels))
 
 
 def _episode(store: 'EpisodeStore', folder: Path, recording: str, episode: int) -> int:
@@ -175,13 +181,15 @@ def numbered(store: 'EpisodeStore', recordings: Iterable[str | Path],
 
 
 def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[str | Path],
-                episodes: Mapping[int, Sequence[Mark]], names: Sequence[str] = ()) -> None:
+                episodes: Mapping[int, Sequence[Mark]], names: Sequence[str] = (),
+                labels: Container[int] = ()) -> None:
     """
     Write a file of marks in one step, a mark a line.
 
     :param recordings: paths of the store.
     :param episodes: marks by the index of their episode.
     :param names: of the marks of a demonstration, in their order.
+    :param labels: the episodes that nobody marked.
     :raises StorageError: when it cannot be written; an existing file is then what it was.
     """
     numbers = numbered(store, recordings, Path(path).resolve().parent)
@@ -190,6 +198,7 @@ def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[st
         seconds = [[round(store[i].stamps[t] / 1e9, 6) for t in mark] for mark in marks]
         recording, number = numbers[i]
         lines.append(json.dumps({'recording': recording, 'episode': number, 'stamps': [
-            first if first == last else [first, last] for first, last in seconds]}))
+            first if first == last else [first, last] for first, last in seconds],
+            **({'label': True} if i in labels else {})}))
     named = f'"names": {json.dumps(list(names))}, ' if names else ''
     write_atomically(path, f'{{{named}"marks": [\n' + ',\n'.join(lines) + '\n]}\n')

@@ -110,6 +110,8 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
     about = [_worth(of_chosen, np.array(true), np.array(guess)) for true, guess in zip(
         np.transpose(list(moments.values())),
         np.transpose(left_out) if left_out else [()] * count)][order]
+    if labels_among := marks.labels.intersection(chosen):  # found in labels made from themselves
+        about = [{'demonstrations': len(chosen), 'labels': len(labels_among)}] * len(about)
     labels: list[np.ndarray | None] = []
     for i, one in enumerate(films):
         if one is None:
@@ -151,7 +153,10 @@ def print_marks_report(about: Sequence[Mapping[str, Any]]) -> None:
     for level, facts in enumerate(about, start=1):
         count = facts['demonstrations']
         name = 'marks' if len(about) == 1 else f'marks, level {level}'
-        if 'found' not in facts:
+        if 'labels' in facts:
+            text = (f'{count} demonstrations, {facts["labels"]} of them labelled by `label`, '
+                    'which said how good its labels are')
+        elif 'found' not in facts:
             text = f'{count} marked, so nothing tells what that is worth; mark ten'
         else:
             found, random = facts['found'], facts['random']

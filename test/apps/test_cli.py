@@ -57,6 +57,16 @@ def test_a_command_without_its_second_word_is_told_the_choices(capsys):
         'error: evaluate needs a second word; valid: prediction, forward\n')
 
 
+@pytest.mark.parametrize('words', [
+    ['tap_ros', '--help'], ['tap_ros', 'train', 'predictor', '--help'],
+    ['experiments', 'paper', '--list']])
+def test_a_reader_who_has_seen_enough_is_no_error(words):
+    with subprocess.Popen([sys.executable, '-m', *words], cwd=ROOT, text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ''
+
+
 def test_a_progress_bar_in_a_pipe_is_one_line(tmp_path):
     words = ['collect', '--out', 'bag', '--episodes', '3', '--task', 'grasp',
              '--episodes-per-file', '1']

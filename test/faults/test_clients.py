@@ -21,20 +21,17 @@ pytestmark = pytest.mark.ros
 DEFAULT_DEPTH = 10  # of the queue of a client in ROS 2
 SOON_S = 10.0
 CLIENTS = '12, 16 or 64 clients for 10 s, or 16 for 2 min'
-ANSWERED = 'each call is answered'
+LEAST = 0.95  # share of calls that are answered with a short queue
 
 
-@pytest.mark.parametrize('clients, depth', [
-    pytest.param(clients, depth, id=name, marks=fault(
-        injected, ANSWERED, seconds, 'answers a second', min))
-    for name, injected, seconds, clients, depth in (
-        *((f'clients-{count}', CLIENTS, 10, count, SERVICE_QOS.depth) for count in (12, 16, 64)),
-        ('clients-default-queue', f'16 clients with the default queue of {DEFAULT_DEPTH} for 40 s',
-         40, 16, DEFAULT_DEPTH),
-        ('clients-long', CLIENTS, 120, 16, SERVICE_QOS.depth))])
-def test_(rig, trials, clients, depth):
+@pytest.mark.parametrize('clients', [
+    pytest.param(clients, id=name, marks=fault(
+        CLIENTS, 'each call is answered', seconds, 'answers a second', min))
+    for name, seconds, clients in (
+        *((f'clients-{count}', 10, count) for count in (12, 16, 64)), ('clients-long', 120, 16))])
+def test_(rig, trials, clients):
     rig.need('predictor_node')
-    load = measure_load(clients, float(trials.count), depth)
+    load = measure_load(clients, float(trials.count), SERVICE_QOS.depth)
     trials.record(times=len(load.latencies) + load.counts['busy'])  # a trial is a call
     trials.measured(load.per_second)
     trials.note = f'{load.counts["busy"]} told to come later'
@@ -43,6 +40,19 @@ def test_(rig, trials, clients, depth):
     for end in ('lost', 'refused'):
         if load.counts[end]:
             trials.record(f'a good request was {end}', load.counts[end])
+
+
+# DDS brings a client the answers to all; its queue may be full of those to others.
+@fault(f'16 clients with the default queue of {DEFAULT_DEPTH}, 10 s', f'at least {LEAST:.0%} of '
+       'the calls are answered', 4, '% of the calls (least)', min)
+def test_clients_default_queue(rig, trials):
+    rig.need('predictor_node')
+    for _ in trials:
+        with trials.one():
+            load = measure_load(16, 10.0, DEFAULT_DEPTH)
+            answered = len(load.latencies) / (len(load.latencies) + load.counts.total())
+            trials.measured(100 * answered)
+            assert answered >= LEAST, f'{load.counts}'
 
 
 @fault('16 clients against one', 'at least 1.5 times as many answers a second', 3,

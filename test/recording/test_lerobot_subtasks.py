@@ -111,8 +111,8 @@ def test_demonstrations_are_known_by_their_index_also_at_a_rate_and_when_one_is_
     capsys.readouterr()
     assert main(['label', bag, '--out', out, '--write-lerobot', str(folder)]) == 0
     said = capsys.readouterr().out
-    assert '1 demonstrations without labels are unlabelled' in said
-    assert 'is of v2.1, and lerobot shows the subtasks of v3.0' in said
+    assert '1 demonstration without labels: unlabelled' in said
+    assert 'is of v2.1, and lerobot shows the subtasks of v3.0 only' in said
     for episode, moment in zip(*moments):
         rows = pandas.read_parquet(folder / f'data/chunk-000/episode_{episode:06d}.parquet')
         assert (rows['subtask_index'] == (rows['timestamp'] >= moment - 1e-3)).all()

@@ -110,6 +110,7 @@ def test_the_command_labels_every_demonstration(tmp_path, shown, capsys):
     assert last['stamp'] == pytest.approx(100 * COUNT + last['seconds'], abs=0.01)
     found = read_marks(tmp_path / 'out' / 'labels.marks.json', store)
     assert found.names == ('a', 'b') and len(found.episodes) == COUNT
+    assert found.labels == {*range(MARKED, COUNT)}
     for i, those in found.episodes.items():
         seconds = [row['seconds'] for row in content['labels'][2 * i:2 * i + 2]]
         assert np.allclose([first / 10 for first, _ in those], seconds, atol=0.051)

@@ -123,6 +123,10 @@ def test_the_likeliest_frames_are_those_about_the_label(bag, store, marks, tmp_p
             assert w[0].argmax() == store.lengths[i] // 2, 'what was marked is not guessed'
     assert np.mean([abs(w[0].argmax() - n // 2) <= 1
                     for w, n in zip(found[10:], store.lengths[10:])]) > 0.7
+    # What was labelled by the others would be found by them: that says nothing.
+    write_marks(marks, store, [bag], read_marks(marks, store).episodes, labels={7, 8, 9})
+    told = episode_preferences(store, config, everything)[1]['marks']['levels']
+    assert told == [{'demonstrations': 10, 'labels': 3}]
     # Of two marks the later one comes first between start and goal, the earlier one forward.
     write_marks(marks, store, [bag], {i: [(1, 1), (3, 3)] for i in range(10)})
     two = replace(config, recursion=2)

@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.options import check_different
-from tap_ros.base.text import escaped, listing
+from tap_ros.base.text import counted, escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode, OUTCOMES
@@ -101,7 +101,7 @@ def run(args: Options) -> None:
         write_marks(path, open_recordings([args.out]), [args.out], {
             i: [(t, t) for t in frames] for i, frames in enumerate(data.marks) if frames})
         print(f'{escaped(path)}: marks where the next subtask begins, of '
-              f'{sum(map(bool, data.marks))} episodes')
+              f'{counted(sum(map(bool, data.marks)), "episode")}')
     print_signals(data.signals, sum(map(len, data.signals.values())))
     if data.unused:
         print(f'not taken: {listing(data.unused)}')

@@ -20,7 +20,7 @@ from tap_ros.base.errors import ConfigError, RecordingError
 from tap_ros.base.files import storage_errors
 from tap_ros.base.options import Bags, File, Folder
 from tap_ros.base.progress import Progress
-from tap_ros.base.text import escaped
+from tap_ros.base.text import counted, escaped
 from tap_ros.images.drawing import png_bytes
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.formats.lerobot_format import (
@@ -85,7 +85,7 @@ def run(args: Options) -> None:
             part.rename(out)
         finally:
             shutil.rmtree(part, ignore_errors=True)
-    print(f'{escaped(out)}: {len(store)} episodes, {store.num_frames} frames, '
+    print(f'{escaped(out)}: {counted(len(store), "episode")}, {store.num_frames} frames, '
           f'{", ".join(name for name in features if "." in name or name == ACTION)}')
 
 

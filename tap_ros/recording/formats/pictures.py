@@ -23,7 +23,7 @@ from tap_ros.base.errors import ConfigError, ImageError, RecordingError, Recordi
 from tap_ros.base.files import only_writer
 from tap_ros.base.options import check_different, default_text, Folder
 from tap_ros.base.progress import Progress
-from tap_ros.base.text import escaped, listing
+from tap_ros.base.text import counted, escaped, listing
 from tap_ros.images.crop import Crop
 from tap_ros.recording.bags import VIDEOS, what_is
 from tap_ros.recording.defects import Defect, describe
@@ -333,4 +333,5 @@ def write_bag(target: Target, episodes: Iterable[Episode | tuple[Episode, Views]
                 file.unlink(missing_ok=True)
             if is_new and not whole:
                 out.rmdir()
-    return f'{escaped(out)}: {done} episodes, {frames} frames of {size[1]}x{size[0]} pixels'
+    return (f'{escaped(out)}: {counted(done, "episode")}, {frames} frames of {size[1]}x{size[0]} '
+            'pixels')

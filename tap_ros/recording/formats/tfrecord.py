@@ -27,7 +27,7 @@ import google_crc32c
 import numpy as np
 from tap_ros.base.contract import MOST_SIGNALS
 from tap_ros.base.errors import ConfigError, ImageError, RecordingError
-from tap_ros.base.text import escaped, listing
+from tap_ros.base.text import counted, escaped, listing
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.other_cameras import other_cameras, print_views
@@ -96,7 +96,8 @@ def run(args: Options) -> None:
     print_views(others)
     print_signals(kept)
     if blank[True]:
-        print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
+        print(f'left out: {counted(blank[True], "episode")} whose pictures of it are of one '
+              'colour')
 
 
 def _missing(files: Iterable[Path]) -> Iterator[str]:
