@@ -33,7 +33,7 @@ class Places:
     :param results: folder of the data and figures; in it runs/small/, a JSON file for each run.
     """
 
-    recordings: Folder = 'bags'
+    recordings: Folder = 'bags/paper'
     runs: Folder = 'runs/paper'
     results: Folder = 'runs/results'
 

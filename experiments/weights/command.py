@@ -38,7 +38,7 @@ class Options:
     :param only: names of weights; none: all.
     :param list: print the commands; do nothing.
     :param threads: of the CPU, for training; 0: as many as there are.
-    :param bags: folder of recordings.
+    :param bags: folder of recordings, of which some are those of the command paper, too.
     :param runs: folder of trainings; those interrupted go on.
     :param out: folder for weights, cards and pictures.
     """
@@ -46,7 +46,7 @@ class Options:
     only: tuple[Annotated[str, one_of(SHIPPED)], ...] = ()
     list: Flag = False
     threads: int = 1
-    bags: Folder = 'bags'
+    bags: Folder = 'bags/paper'
     runs: Folder = 'runs/weights'
     out: Folder = 'runs/weights/shipped'
 

@@ -217,7 +217,10 @@ def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
     rows = []
     side = max(PANEL, min(LARGEST_PANEL, *(max(one.image.shape) for one in subgoals)))
     for subgoal in subgoals:
-        panels = [(name, picture, pixels[name]) for name, picture in pictures.items()]
+        height, width = subgoal.image.shape[:2]
+        panels = [(
+            name if picture.shape[0] * width == picture.shape[1] * height else f'{name}, whole',
+            picture, pixels[name]) for name, picture in pictures.items()]
         panels.append((_title(subgoal, len(subgoals)), subgoal.image, pixels['start'][:0]))
         if len(pixels['start']):
             panels.append(('where the objects are then', overlay(

@@ -255,7 +255,9 @@ def test_real_nodes_push_in_a_world_of_others_that_says_how_it_ended(tmp_path, c
     assert command.run(command.Options(
         scenes=1, tasks=('push-v3',), world='metaworld', robot_mask='arm', step_budget=1,
         out=str(folder))) == 0
-    assert re.search(r'direct .* in 1 steps.*subgoal .* in 1 steps', capsys.readouterr().out)
+    said = capsys.readouterr()
+    assert re.search(r'direct .* in 1 steps.*subgoal .* in 1 steps', said.out)
+    assert 'the shipped weights know the table alone' in said.err
     assert (folder / 'push-v3.webp').stat().st_size and (folder / 'report.html').stat().st_size
     one = open_recordings([folder / 'recording'])[-1]
     assert (len(one), one.task, one.outcome) == (2, 'push-v3', 'failure')

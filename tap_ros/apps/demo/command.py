@@ -51,7 +51,7 @@ from tap_ros.base.plugins import load_plugin, names
 from tap_ros.robots.arm import DEFAULT_ARM
 from tap_ros.ros.client import Client
 from tap_ros.ros.views import positions_of
-from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
+from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODELS, PREDICTORS
 from tyro import conf
 
 FIRST_SCENE = 2_000_000  # seeds from here on are in no recording, no training and no table
@@ -162,6 +162,10 @@ def run(args: Options) -> int:
     :raises TapError: when no scene could be finished.
     """
     args.check()
+    used = {args.forward_model, *map(args.weights, args.tasks)}
+    if args.world != TABLE and used & {*PREDICTORS, *FORWARD_MODELS}:
+        print(f'warning: world {args.world}: the shipped weights know the table alone; give '
+              '--predictor and --forward-model that were trained there', file=sys.stderr)
     folder = free_folder(args.out)
     print(f'starting nodes; their logs are in {folder / "logs"}', flush=True)
     begin, scenes, left_out = time.monotonic(), list[Scene](), dict[str, str]()
