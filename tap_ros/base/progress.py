@@ -1,23 +1,29 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Progress bars, and one line in their place where nobody watches: in a pipe, or a log."""
+"""Progress bars, and a line now and then in their place in a pipe or a log."""
 
 from typing import Any
 
 from tqdm import tqdm
 
+EVERY_S = 300.0  # of the lines where nobody watches
+
 
 class Progress(tqdm):  # type: ignore[misc]
-    """A progress bar on a terminal; elsewhere it prints one line, at its end."""
+    """A progress bar on a terminal; elsewhere a line at its end, and every five minutes."""
 
-    _ends = False
+    disable: bool
+    _ends, _told = False, 0.0
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:
-        """Draw it; without a terminal only when it ends."""
+        """Draw it; without a terminal only now and then."""
         if self.fp.isatty():
             return bool(super().display(msg, pos))
-        if self._ends and msg is None:
-            self.fp.write(str(self))  # close() adds the end of the line
+        seconds = self.format_dict['elapsed']
+        if msg is None and self.n and (self._ends or seconds > self._told + EVERY_S):
+            self.fp.write(str(self) + '\n' * (not self._ends))  # close() adds the last one
+            self.fp.flush()
+            self._told = seconds
         return False
 
     def clear(self, *args: Any, **kwargs: Any) -> None:
@@ -28,4 +34,7 @@ class Progress(tqdm):  # type: ignore[misc]
     def close(self) -> None:
         """End it, leaving its last state."""
         self._ends = True
+        if not self.disable and not self.n and not self.fp.isatty():  # nothing was to be done
+            self._decr_instances(self)
+            self.disable = True
         super().close()

@@ -7,10 +7,12 @@ from importlib import import_module
 from pathlib import Path
 import subprocess
 import sys
+import time
 
 import pytest
 import tap_ros
 from tap_ros.__main__ import LINE, main
+from tap_ros.base import progress
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.split import split_episodes
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
@@ -74,6 +76,15 @@ def test_a_progress_bar_in_a_pipe_is_one_line(tmp_path):
                          capture_output=True, check=True)
     line, = run.stderr.splitlines()
     assert '3/3' in line and '\r' not in run.stderr
+
+
+def test_a_log_says_now_and_then_how_far_a_long_job_is(monkeypatch, capsys):
+    monkeypatch.setattr(progress, 'EVERY_S', 0.2)
+    for _ in progress.Progress(range(5)):
+        time.sleep(0.15)
+    assert not list(progress.Progress([]))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) > 1 and '5/5' in lines[-1] and all('/5' in line for line in lines)
 
 
 def test_inspect_holds_out_what_a_training_does(capsys):
