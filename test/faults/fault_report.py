@@ -27,9 +27,9 @@ MAX_REASONS = 4
 HEAD = """\
 # Faults
 
-Each line has a fault of real nodes (during a goal, unless it says otherwise) or of a disk; what
-must happen; in how many trials, of how many, it did, without a traceback or an unexplained error
-in a log; and the worst trial, the least or the median where it says so. Made by `{command}` in
+Each line gives a fault of real nodes (during a goal, unless it says otherwise) or of a disk; what
+must happen; in how many of the trials it did, without a traceback or an unexplained error in a
+log; and the worst trial, or the least or median where it says so. Made by `{command}` in
 {minutes:.0f} minutes, {dates}, commit {commits}, on {machines}; data:
 [faults.json](faults.json).
 
