@@ -24,6 +24,7 @@ from tap_ros.base.contract import CAMERA_SIZE
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import Folder
+from tap_ros.base.progress import Progress
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.strips import write_lines
 from tap_ros.images.drawing import grid
@@ -33,7 +34,6 @@ from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
 import torch
 from torch.nn import functional
-from tqdm import tqdm
 
 FIRST_SCENE = 910_000  # seeds from here on are in no recording that anything is trained on
 ROWS = ('push2', 'order2', 'order2 demonstrated', 'stack2', 'grasp', 'pick_place')
@@ -93,7 +93,8 @@ def run(args: Options) -> None:
         scores = found[row] = []
         try:
             seeds = range(args.first_scene, args.first_scene + args.scenes)
-            for case in tqdm(cases(camera, seeds, bool(demonstrated)), row, args.scenes, delay=1):
+            for case in Progress(cases(camera, seeds, bool(demonstrated)), row, args.scenes,
+                                 delay=1):
                 score, pictures = compare(network, predictor, case)
                 scores.append(score)
                 if len(scores) <= SHOWN:

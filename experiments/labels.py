@@ -10,9 +10,9 @@ import numpy as np
 from tap_ros.apps.label_command import describe_all, Signals, WITHIN_S
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.options import File, Folder
+from tap_ros.base.progress import Progress
 from tap_ros.recording.reading import Reading, Topics
 from tap_ros.training.labels import Film, label, SIZE
-from tqdm import tqdm
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def run(options: Options) -> None:
     names = [name for name in truth['0'] if name.endswith('_s')]
     moments = [np.array([truth[str(i)][name] for name in names]) for i in range(len(store))]
     errors: dict[str, list[np.ndarray]] = {'labels': [], 'fixed share of the time': []}
-    for draw in tqdm(range(options.draws), desc='labelling', delay=1):
+    for draw in Progress(range(options.draws), desc='labelling', delay=1):
         chosen = np.random.default_rng(draw).choice(len(films), options.marks, replace=False)
         found = guess(films, moments, chosen.tolist(), names)
         for way, labels in found.items():

@@ -19,8 +19,8 @@ from tap_ros.base.engines import LOCAL, run_tasks, Work
 from tap_ros.base.errors import TapError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import Folder
+from tap_ros.base.progress import Progress
 from tap_ros.training.run_config import FREE
-from tqdm import tqdm
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def sweep(runs, places, engine=LOCAL):
         if not folder.exists() or (folder / SETTINGS_FILE).exists():
             collect(folder, RECORDINGS[name], engine)
     tasks, failed = [Work(run.name, perform, (run, places)) for run in waiting], {}
-    with tqdm(total=len(tasks), desc='paper', unit='run') as bar:
+    with Progress(total=len(tasks), desc='paper', unit='run') as bar:
         for task, get in run_tasks(tasks, engine):
             try:
                 get()

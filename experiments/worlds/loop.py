@@ -37,11 +37,11 @@ from tap_ros.base.engines import Engine
 from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically, write_rows
 from tap_ros.base.options import Flag, Folder
+from tap_ros.base.progress import Progress
 from tap_ros.evaluation.intervals import mean_interval, share_interval
 from tap_ros.images.drawing import grid
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
-from tqdm import tqdm
 
 BAGS = {'random': 100_000, 'goal': 0}  # of pushes; the first seed
 METHODS = (*UNTRAINED, *PLANNED)
@@ -220,7 +220,7 @@ def run_scenes(args, task, weights, training=0):
     chosen = [method for method in args.methods if method in weights
               and (task in SUBGOALS or method not in WITH_WAYS)]
     seed, count = FIRST_SCENE, 0
-    with tqdm(total=args.scenes, unit='scene', desc=f'{task}: {", ".join(chosen)}') as bar:
+    with Progress(total=args.scenes, unit='scene', desc=f'{task}: {", ".join(chosen)}') as bar:
         while chosen and count < args.scenes:
             rows = done.setdefault(seed, {})
             for method in chosen:

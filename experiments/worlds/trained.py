@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from tap_ros.base.engines import run_tasks, Work
 from tap_ros.base.files import write_atomically
-from tqdm import tqdm
+from tap_ros.base.progress import Progress
 
 MARKED = 10  # demonstrations of each task, others in each training
 # A name in tables: settings beside those that all have.
@@ -64,7 +64,7 @@ def train_all(folders, methods, seeds, out, engine):
                 CUTS.get(task, '')))
             for seed in range(seeds) for task, folder in folders.items() for method in methods]
     rows = []
-    with tqdm(total=len(work), unit='training') as bar:
+    with Progress(total=len(work), unit='training') as bar:
         for task, get in run_tasks(work, engine):
             name, method, number = task.name.rsplit('/', 2)
             rows.append({'task': name, 'method': method, 'seed': int(number), **get()})
