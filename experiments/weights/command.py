@@ -26,7 +26,8 @@ SHIPPED = {
                         'grasp_more': {'episodes': 3000, 'seed': 100_000}}),
     'grasp_forward': ('grasp', {'grasp': {'episodes': 3000}}),
     'pick_place': ('pick_place', {'pick_place': {'episodes': 3000},
-                                  'pick_place_more': {'episodes': 4000, 'seed': 100_000}}),
+                                  'pick_place_more': {'episodes': 4000, 'seed': 100_000},
+                                  'pick_place_most': {'episodes': 7000, 'seed': 200_000}}),
     'pick_place_vae': ('pick_place', {'pick_place': {'episodes': 3000}})}
 
 

@@ -229,7 +229,7 @@ RECIPES = {  # the first stands for recordings of other tasks
     'stack3': _GRIPPING,
     'grasp': replace(_GRIPPING, steps=10000),
     'grasp_forward': replace(_GRIPPING, mode='forward', selection='absolute'),
-    'pick_place': replace(_GRIPPING, steps=20000),
+    'pick_place': replace(_GRIPPING, steps=30000),
     'pick_place_vae': replace(
         _GRIPPING, selection='absolute', latent='vae', margin=0, kl_weight=2e-5, free_nats=4.0),
     # A dozen marked demonstrations, see marks. The moment may be three frames from the goal. As
