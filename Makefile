@@ -19,7 +19,7 @@ SOURCES := package.xml setup.py setup.cfg tap_ros/base/contract.py resource/tap_
 # An environment that was copied or moved here from elsewhere names the old place everywhere.
 $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 
-.PHONY: help demo explore test test-all docs paper worlds faults build lint bench ros2 clean
+.PHONY: help demo explore test test-all docs paper worlds faults build lint bench ros2 ros2.missing clean
 
 help:
 	@echo 'make demo    push objects to a goal picture, directly and via the predicted subgoal'
@@ -94,12 +94,15 @@ build: .venv/build.done
 	@touch $@
 
 # In the environment of `make build`; apart from it, so that nothing else depends on it.
-ros2: build ros2/done
+ros2: build .venv/ros2.done
 	@:
 
-ros2/done: scripts/ros2.bash requirements-ros2.txt | build
+.venv/ros2.done: scripts/ros2.bash requirements-ros2.txt \
+  $(if $(wildcard ros2/install/local_setup.bash),,ros2.missing) | build
 	@scripts/ros2.bash
 	@touch $@
+
+ros2.missing:
 
 clean:
 	rm -rf .venv build install log ros2

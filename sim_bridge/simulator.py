@@ -156,8 +156,9 @@ class Simulator(Table):
         for name, place in zip(self.object_names, places):
             if not np.isfinite(place).all():
                 raise SceneError(f'the goal of {name} is not on the table')
-            if far := [f'{max(1, round(100 * (abs(one) - limit)))} cm too far '
+            if far := [f'{max(1, round(100 * (abs(one) - limit)))} cm too '
                        f'{less if one < 0 else more}' for one, less, more in zip(
-                           place, ('left', 'forward'), ('right', 'back')) if abs(one) > limit]:
+                           place, ('far left', 'near'), ('far right', 'far away'))
+                       if abs(one) > limit]:
                 raise SceneError(f'the goal of {name} is out of reach: {", ".join(far)}; expected '
-                                 f'at most {100 * limit:g} cm from the middle')
+                                 f'at most {100 * limit:g} cm from the middle each way')

@@ -60,18 +60,35 @@ def main(line: CommandLine, arguments: Sequence[str] | None = None) -> int:
     Run one command.
 
     :param arguments: list of strings; by default those of the process.
-    :return: exit code: 0, 1 after an error that was named, 130 when interrupted.
+    :return: exit code: 0, 1 after an error that was named or when nobody reads the output, 130
+        when interrupted.
     :raises SystemExit: with code 2 for words that are no command or option, which are printed;
         with code 0 after --help.
     """
+    code: int | SystemExit
     try:
         try:
-            return _main(line, sys.argv[1:] if arguments is None else list(arguments))
-        finally:
+            code = _main(line, sys.argv[1:] if arguments is None else list(arguments))
+        except SystemExit as end:  # what --help prints is not written yet
+            code = end
+        if sys.stdout:
             sys.stdout.flush()
-    except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):  # who read it has seen enough: `... | head`
+            print(f'error: {_about(error)}', file=sys.stderr)
+        if sys.stdout:  # nothing is left to flush
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    if isinstance(code, SystemExit):
+        raise code
+    return code
+
+
+def _about(error: OSError) -> str:
+    """Return cause and remedy in one line."""
+    place = f'{escaped(error.filename)}: ' if error.filename else ''
+    return (f'{place}{escaped(error.strerror or error)}; see whether the place is there, yours '
+            'and not full')
 
 
 def _main(line: CommandLine, arguments: Sequence[str]) -> int:
@@ -95,9 +112,7 @@ def _main(line: CommandLine, arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         raise
     except OSError as error:
-        place = f'{escaped(error.filename)}: ' if error.filename else ''
-        message = (f'{place}{escaped(error.strerror or error)}; see whether the place is there, '
-                   'yours and not full')
+        message = _about(error)
     except KeyboardInterrupt as error:
         print('; '.join(['interrupted', *map(str, error.args)]), file=sys.stderr)
         # After one that left an exec(), as in making a dataclass, Python ends by SIGINT though it

@@ -3,7 +3,7 @@
 """The command `python -m tap_ros evaluate prediction`: score, print, write."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -169,11 +169,13 @@ def _split(store: EpisodeStore, training: dict[str, Any], everything: bool,
 def _read_marks(path: str, store: EpisodeStore, episodes: np.ndarray,
                 training: dict[str, Any]) -> Marks | None:
     """
-    Return the marks of a file, of some of these episodes at least; None without a file.
+    Return the marks of a file, without labels, of some of these episodes; None without a file.
 
     :return: of weights that were trained on the marks of one name, those alone.
     """
     marks = read_marks(path, store) if path else None
+    if marks:
+        marks = replace(marks, episodes=marks.marked)
     if marks and (name := training.get('settings', {}).get('mark_name')):
         marks = marks.named(name)
     if marks and marks.episodes.keys().isdisjoint(episodes.tolist()):

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from tap_ros.base.errors import ConfigError
 from tap_ros.base.files import write_atomically
 from tap_ros.base.options import File, Folder
 from tap_ros.base.progress import Progress
@@ -94,8 +95,11 @@ def run(options: Options) -> None:
         options.recordings, reading_of(options.reading), options.signals)
     path = Path(options.marks) if options.marks else beside(options.recordings[0])
     marks = read_marks(path, store)
+    by_hand = marks.marked
+    if not by_hand:
+        raise ConfigError(f'{escaped(path)}: all of them are labels; mark some demonstrations')
     marked = {i: store.seconds(i)[[(first + last) // 2 for first, last in those]]
-              for i, those in marks.episodes.items()}
+              for i, those in by_hand.items()}
     names = marks.names or tuple(
         f'mark {k + 1}' for k in range(len(next(iter(marked.values()), ()))))
     labels = label(films, marked, names, progress=True)
@@ -112,9 +116,9 @@ def run(options: Options) -> None:
         'names': names, 'marks': marks.digest, 'labels': rows}, indent=1) + '\n')
     write_atomically(out / 'labels.csv', to_csv(rows))
     frames = {i: those for i in range(len(store)) if (
-        those := marks.episodes.get(i) or frames_of(store, i, labels.moments[i]))}
+        those := by_hand.get(i) or frames_of(store, i, labels.moments[i]))}
     write_marks(out / 'labels.marks.json', store, options.recordings, frames, names,
-                frames.keys() - marks.episodes.keys())
+                frames.keys() - by_hand.keys())
     write_atomically(out / 'labels.png', png_bytes(contact_sheet(store, labels, set(marked))))
     parts = segment_names(names)
     for source, name in distinct_names(store).items():

@@ -38,10 +38,12 @@ class Marking:
         self.store, self.path, self.recordings = store, path, recordings
         self._lock = threading.Lock()
         self._marks: dict[int, Sequence[Mark]] = {}
+        self._by_label: frozenset[int] = frozenset()  # those that nobody has marked
         self.names = tuple(names)
         if path.exists():
             known = read_marks(path, store)
             self._marks, self.names = dict(known.episodes), self.names or known.names
+            self._by_label = known.labels
             if known.names and self.names != known.names:
                 raise ConfigError(f'names: {listing(names)}, but the marks in {path} are '
                                   f'{listing(known.names)}; leave --names out, or choose another '
@@ -78,8 +80,9 @@ class Marking:
             marks = {i: those for i, those in self._marks.items() if i != episode}
             if frames:
                 marks[episode] = [(t, t) for t in rising]
-            write_marks(self.path, self.store, self.recordings, marks, self.names)
-            self._marks = marks
+            by_label = self._by_label - {episode}
+            write_marks(self.path, self.store, self.recordings, marks, self.names, by_label)
+            self._marks, self._by_label = marks, by_label
             self._ask()
 
     def state(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ EVERY_S = 300.0  # of the lines where nobody watches
 
 
 class Progress(tqdm):  # type: ignore[misc]
-    """A progress bar on a terminal; elsewhere a line at its end, and every five minutes."""
+    """A progress bar on a terminal; elsewhere a line every five minutes, and at its end."""
 
     disable: bool
     _ends, _told = False, 0.0
@@ -20,7 +20,8 @@ class Progress(tqdm):  # type: ignore[misc]
         if self.fp.isatty():
             return bool(super().display(msg, pos))
         seconds = self.format_dict['elapsed']
-        if msg is None and self.n and (self._ends or seconds > self._told + EVERY_S):
+        now = self.n != self.total and seconds > self._told + EVERY_S
+        if msg is None and self.n and (self._ends or now):
             self.fp.write(str(self) + '\n' * (not self._ends))  # close() adds the last one
             self.fp.flush()
             self._told = seconds

@@ -55,6 +55,11 @@ class Marks:
     names: tuple[str, ...] = ()
     labels: frozenset[int] = frozenset()
 
+    @property
+    def marked(self) -> dict[int, Sequence[Mark]]:
+        """Return the marks of the episodes that a person marked."""
+        return {i: those for i, those in self.episodes.items() if i not in self.labels}
+
     def number(self, name: str, episodes: Iterable[int]) -> int:
         """
         Return the number, from 0, of the marks of a name.
@@ -109,7 +114,7 @@ def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
             f'{name}: {error.strerror}; make it by `python -m tap_ros mark`') from error
     except RecordingError as error:
         raise ConfigError(str(error)) from error
-    except (AttributeError, LookupError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise ConfigError(f'{name}: is no file of marks; expected {{"marks": [{{"recording": '
                           '"door", "episode": 0, "stamps": [13.25]}]}, with seconds') from error
     episodes: dict[int, Sequence[Mark]] = {}

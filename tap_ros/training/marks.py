@@ -154,8 +154,8 @@ def print_marks_report(about: Sequence[Mapping[str, Any]]) -> None:
         count = facts['demonstrations']
         name = 'marks' if len(about) == 1 else f'marks, level {level}'
         if 'labels' in facts:
-            text = (f'{count} demonstrations, {facts["labels"]} of them labelled by `label`, '
-                    'which said how good its labels are')
+            text = (f'{count} demonstrations, {facts["labels"]} of them labels; `label` printed '
+                    'how good these are')
         elif 'found' not in facts:
             text = f'{count} marked, so nothing tells what that is worth; mark ten'
         else:

@@ -102,7 +102,7 @@ class Run(Generic[Config]):
         self._data_hash = self.store.data_hash
         marked: Mapping[int, Any] = {}
         if marks := getattr(config, 'marks', ''):
-            marked = read_marks(marks, self.store).episodes
+            marked = read_marks(marks, self.store).marked
             self._data_hash = hashlib.sha256(
                 self._data_hash.encode() + Path(marks).read_bytes()).hexdigest()
         self.training, self.held_out = with_masks(self.store, split_episodes(

@@ -69,6 +69,15 @@ def test_a_reader_who_has_seen_enough_is_no_error(words):
         assert process.stderr.read() == ''
 
 
+@pytest.mark.parametrize('words', [['--version'], ['train', 'predictor', '--help']])
+def test_output_that_nothing_has_room_for_is_an_error_in_one_line(words):
+    with open('/dev/full', 'w') as full:
+        run = subprocess.run([sys.executable, '-m', 'tap_ros', *words], cwd=ROOT, text=True,
+                             stdout=full, stderr=subprocess.PIPE)
+    assert run.returncode == 1 and run.stderr.startswith('error: No space left')
+    assert run.stderr.count('\n') == 1
+
+
 def test_a_progress_bar_in_a_pipe_is_one_line(tmp_path):
     words = ['collect', '--out', 'bag', '--episodes', '3', '--task', 'grasp',
              '--episodes-per-file', '1']

@@ -32,7 +32,7 @@ from tap_ros.base.options import parse
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.full_size import FullSize
 from tap_ros.recording.gripper_moves import gripper_moves
-from tap_ros.recording.marks import read_marks
+from tap_ros.recording.marks import read_marks, write_marks
 from tap_ros.recording.reading import Reading
 
 COUNT, WIDE, HIGH = 14, 96, 72
@@ -207,6 +207,13 @@ def test_marks_with_names_are_complete_and_in_their_order(bag, store, tmp_path):
     for text in ('a,,b', 'a,a', ',', ','.join('abcdefghij')):
         with pytest.raises(ConfigError, match='^names: expected 1 to 9 different'):
             parse_names(text)
+
+
+def test_what_is_marked_is_no_label_any_more(bag, store, tmp_path):
+    path = tmp_path / 'marks.json'
+    write_marks(path, store, [bag], {0: [(1, 1)], 1: [(1, 1)]}, labels={0, 1})
+    Marking(store, [str(bag)], path).mark(0, [2])
+    assert read_marks(path, store).labels == {1}
 
 
 def test_a_gripper_that_was_recorded_proposes_moments(page):

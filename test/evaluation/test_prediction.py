@@ -286,7 +286,8 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     with pytest.raises(ConfigError, match='marked; .* from 0: 0, 1, 2'):
         score([*common, '--all', '--marks', str(marks)])
     assert 'prediction' not in capsys.readouterr().out, 'nothing is scored before'
-    write_marks(marks, open_recordings([bag], progress=False), [bag], {0: [(2, 4)], 2: [(7, 7)]})
+    write_marks(marks, open_recordings([bag], progress=False), [bag], {
+        0: [(2, 4)], 1: [(5, 5)], 2: [(7, 7)]}, labels={1})  # no truth
     with pytest.warns(RecordingWarning, match='3 episodes are'):
         score([*common, '--all', '--samples', '3', '--marks', str(marks), '--out',
                str(tmp_path / 'out')])

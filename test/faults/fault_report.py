@@ -177,7 +177,8 @@ def page(rows):
     missed = [f'- {row["injected"]}: {row["held"]} of {row["tried"]}.\n' for row in rows
               if row['held'] < row['tried']]
     share = min(row['share'] for row in rows)  # of the trials
-    command = 'make faults' + (f' ARGS="--share {share:g}"' if share < 1 else '')
+    command = 'make faults REPORT=docs/results' + (
+        f' ARGS="--share {share:g}"' if share < 1 else '')
     minutes = sum(row['seconds'] for row in rows) / 60
     head = HEAD.format(command=command, minutes=minutes, **{
         f'{key}s': listing(sorted({row[key] for row in rows}))

@@ -165,7 +165,7 @@ def test_what_cannot_be_done_is_said_moves_nothing_and_is_no_error_of_a_node(exp
         assert page.locator('#step-go button.main').get_attribute('id') == 'subgoal-run'
         for place, why in (
                 ((second['u'], second['v']), f'{second["name"]}.* would overlap'),
-                ((5, 5), r'out of reach: \d+ cm too far left, \d+ cm too far back; .* 35 cm'),
+                ((5, 5), r'out of reach: \d+ cm too far left, \d+ cm too far away; .* 35 cm'),
                 ((-9, 90), 'would be outside the picture')):
             problems = state(page)['problem']['count']
             drag(page, first['name'], *place)

@@ -127,9 +127,9 @@ def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(simulator):
     before, state = simulator.goal(), simulator.state()
     for places, words in (
             (PLACES[:1], r'shape \(2, 2\), got \(1, 2\)'),
-            ([[0.2, 0.1], [0.1, -0.351]], 'object_1 is out .*: 1 cm too far forward; .* 35 cm'),
+            ([[0.2, 0.1], [0.1, -0.351]], 'object_1 is out .*: 1 cm too near; .* 35 cm'),
             ([[0.36, 0.1], [-0.4, 0.46]], 'object_0 is out of reach: 1 cm too far right;'),
-            ([[0.1, 0.1], [-0.4, 0.46]], 'object_1 .*: 5 cm too far left, 11 cm too far back;'),
+            ([[0.1, 0.1], [-0.4, 0.46]], 'object_1 .*: 5 cm too far left, 11 cm too far away;'),
             ([[np.nan, 0.1], [0.1, 0.1]], 'object_0 is not on the table'),
             ([[0.1, 0.1], [0.1, np.inf]], 'object_1 is not on the table'),
             ([[0.1, 0.1], [0.1, 0.1]], 'object_0 and object_1 would overlap')):

@@ -111,6 +111,9 @@ def test_the_command_labels_every_demonstration(tmp_path, shown, capsys):
     found = read_marks(tmp_path / 'out' / 'labels.marks.json', store)
     assert found.names == ('a', 'b') and len(found.episodes) == COUNT
     assert found.labels == {*range(MARKED, COUNT)}
+    again = tmp_path / 'out' / 'labels.marks.json'
+    assert main(['label', str(bag), '--marks', str(again), '--out', str(tmp_path / 'more')]) == 0
+    assert f'Each of {MARKED} marked demonstrations' in capsys.readouterr().out
     for i, those in found.episodes.items():
         seconds = [row['seconds'] for row in content['labels'][2 * i:2 * i + 2]]
         assert np.allclose([first / 10 for first, _ in those], seconds, atol=0.051)

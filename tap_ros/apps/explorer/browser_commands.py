@@ -290,7 +290,8 @@ class ExplorerCalls:
     def _reach(self, mode: str) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self._stage = f'{words}: waiting for the planner'
-        self.forget_end()
+        self.to_subgoal = False
+        self.forget_end(mode=mode)
         cancelled = self._cancelled
         if cancelled:
             raise CallError(f'{words}: cancelled before it began')

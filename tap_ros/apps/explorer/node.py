@@ -199,7 +199,8 @@ class ExplorerNode(Node):
         if 'subgoal' in changed:
             self._subgoal = shown.subgoal()
         objects, goals = shown.places('objects'), shown.places('goal_objects')
-        targets = shown.expected() if running and calls.to_subgoal else goals
+        first = running and calls.to_subgoal
+        targets = shown.expected() if first else goals
         now, simulator, tracker = (
             time.monotonic(), calls.offered('reset'), calls.offered('select'))
         self._server.put('state', json.dumps({
@@ -222,7 +223,7 @@ class ExplorerNode(Node):
                      'objects': display.listed(goals, newest.get('goal_objects', [None])[0]),
                      'pictured': 'goal' in newest},
             'problem': shown.events.problem, 'events': shown.events.count,
-            'run': {'running': running, 'stage': stage, 'to_subgoal': calls.to_subgoal,
+            'run': {'running': running, 'stage': stage, 'to_subgoal': first,
                     **calls.end},
             'nodes': self._states.lines(now, self._present, tracker)}))
 

@@ -51,7 +51,7 @@ function accepted() {
 // Why a frame is proposed as a mark: what moves there, and the label.
 function reasons(t, k) {
   return [...about.moves.filter(([at]) => at === t).map(([, closes]) => closes === null ? 'hand moves' : moveOf(closes)),
-    ...labels().slice(k, k + 1).map(([at, sure]) => `label ${second(at)}, confidence ${Math.round(100 * sure)}%`)];
+    ...(labels().length === proposed().length ? labels().slice(k, k + 1) : []).map(([at, sure]) => `label ${second(at)}, confidence ${Math.round(100 * sure)}%`)];
 }
 
 const moveOf = (closes) => closes === null ? 'hand' : `gripper ${closes ? 'closes' : 'opens'}`;
