@@ -106,12 +106,8 @@ class Display:
         message, _ = self.newest.get('subgoal', (Subgoal(), 0.0))
         if (message.image.width, message.image.height) != self.sizes.get('camera'):
             return {}  # of a part of the picture
-        try:
-            pixels = decode_subgoal(message, message.object_names).expected_pixels
-            return {name: (u, v) for name, (u, v) in zip(message.object_names, pixels.tolist())}
-        except TapError as error:
-            self.warn(error)
-            return {}
+        return {name: (at.x, at.y) for name, at in zip(
+            message.object_names, message.expected_pixels) if math.isfinite(at.x + at.y)}
 
     def size(self, kind: str) -> dict[str, int]:
         """Return width and height of the newest picture of a kind; 0 without one."""
