@@ -96,7 +96,7 @@ def test_a_camera_is_asked_for_only_among_those_that_show_something(tmp_path, ca
     file, out = tmp_path / 'a.tfrecord-00000-of-00001', tmp_path / 'bag'
     file.write_bytes(record(rlds(frames, image_1=blank)) + record(rlds(blank, image_1=blank)))
     code, said = run_import(capsys, 'import-tfrecord', file, '--out', out)
-    assert code == 0 and '1 episodes' in said and 'left out: 1 episodes' in said
+    assert code == 0 and ': 1 episode,' in said and 'left out: 1 episode whose' in said
     depth = rlds(frames, image_1=blank, wrist=wrist)
     depth['steps/observation/depth'] = 6 * [cv2.imencode('.png', np.full((8, 8), 900, np.uint16))[
         1].tobytes()]
