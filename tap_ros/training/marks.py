@@ -107,11 +107,13 @@ def label_episodes(store: 'EpisodeStore', marks: Marks, training: np.ndarray,
         for first, last in marks.episodes[i]]) / 1e9 for i in chosen}
     of_chosen = [one for i in chosen if (one := films[i])]
     model, left_out = fit(of_chosen, list(moments.values()), progress)
-    about = [_worth(of_chosen, np.array(true), np.array(guess)) for true, guess in zip(
-        np.transpose(list(moments.values())),
-        np.transpose(left_out) if left_out else [()] * count)][order]
-    if labels_among := marks.labels.intersection(chosen):  # found in labels made from themselves
-        about = [{'demonstrations': len(chosen), 'labels': len(labels_among)}] * len(about)
+    if among := marks.labels.intersection(chosen):  # they come from each other
+        about = [{'demonstrations': len(chosen), 'labels': len(among)}] * count
+    else:
+        about = [_worth(of_chosen, np.array(true), np.array(guess)) for true, guess in zip(
+            np.transpose(list(moments.values())),
+            np.transpose(left_out) if left_out else [()] * count)]
+    about = about[order]
     labels: list[np.ndarray | None] = []
     for i, one in enumerate(films):
         if one is None:
