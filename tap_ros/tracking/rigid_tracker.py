@@ -9,7 +9,7 @@ where it was; what was not found near by is searched everywhere.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -25,17 +25,21 @@ from tap_ros.tracking.template import APART, Matcher, Pose, SURE, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
 REST, REST_TURN = 0.012, 0.1  # the same, of what the hand is not near to
-CARRIED, CARRIED_TURN = 0.03, 0.3  # of what may be carried, from where the hand is
+CARRIED, CARRIED_TURN = 0.03, 0.5  # of what may be carried
 HAND_FAR, HAND_HIGH = 0.22, 0.1  # m: a hand farther off, or higher, moves nothing
 HAND_HALF = 0.02  # m, half as wide as the fingers are
 LIFTED = 0.01  # m, from where on it is above the table
+OPEN = 0.95  # opening from which on it holds nothing
 HELD = 0.04  # m from the hand to what it holds
 GOOD, GOOD_COST = 0.7, 0.35  # fit of what is believed; cost up to which no other is tried
 CLEARER = 0.03  # less cost of another than the likeliest pose
+DROPPED = 0.1  # less cost of what is not in the hand any more
 MOST_COST = 0.4  # of what is found far from where it was
 NEW_COST, NEW_ANGLE, NEW_SEEN = 0.25, 0.35, 0.85  # from when on the object is cut out anew
-SHARED = 0.8  # of the part of an object that was known, in what is all of it
+# Weight of the middle of a part of an object beside a click that is so many px off at most.
+PART, CLICKED = 0.25, 20.0
 UNSURELY = 0.8  # factor of the confidence in an object whose middle is not known
+OTHERS = 0.1  # share of other objects in such a cut from which on it is none
 WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
 RECURS = 0.6  # share of the colours of the first template in such a cut
@@ -43,7 +47,7 @@ KEYS = 6  # templates of an object, the first among them
 BENEATH = 0.1  # m from where an object seems to be that lies on another, to that
 KEPT = 0.1  # weight of places where a goal picture shows nothing else
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
-MOST = (0.5, 1.8)  # of its area, that has to be there then
+MOST = (0.3, 1.8)  # share of its area that has to be there then, from and to
 # Confidence in the last place of an object: at once, and the factor of each further picture.
 DOUBT = {HIDDEN: (0.88, 0.95), UNSURE: (0.5, 0.9), LOST: (0.5, 0.9)}
 PATIENCE = 2  # pictures in which what should be seen may be missed, before it is lost
@@ -64,7 +68,7 @@ class _Object:
     searched: Picture | None = None  # in which it was found; None: it is not seen
     waits: int = 0  # pictures until it may be cut out anew
     sure: bool = True  # its middle is known, not only a click near it
-    part: bool = False  # the robot hid a part of it so far
+    part: float = 0.0  # share of its outline beyond which it may go on unseen; 0: it is whole
 
     def nearest(self) -> list[Template]:
         """Return its templates, those first that show it turned like now."""
@@ -75,7 +79,7 @@ class _Object:
         return float(np.abs(np.angle(np.exp(1j * (self.angle - key.angle)))))
 
     def pushed(self, hand: np.ndarray) -> np.ndarray:
-        """Return where (3,) m the hand (2, 3), before and now, has pushed it on the table."""
+        """Return where (3,) m on the table the gripper (2, 4), before and now, has pushed it."""
         way = hand[1, :2] - hand[0, :2]
         length = float(np.linalg.norm(way))
         if hand[:, 2].max() > TOP or not length:
@@ -88,11 +92,13 @@ class _Object:
         return self.place + np.append(along * far, 0)
 
     def carried(self, hand: np.ndarray) -> list[np.ndarray]:
-        """Return where (3,) m it is above the table if the hand (2, 3) holds it, else nothing."""
-        off = self.face.placed(self.face.points, self.place, self.angle) - hand[0]
+        """Return where (3,) m it is if the gripper (2, 4) holds it above the table, or nothing."""
+        off = self.face.placed(self.face.points, self.place, self.angle) - hand[0, :3]
         held = np.linalg.norm(off[:, :2], axis=1).min() < HELD and off[0, 2] > -TOP
-        place = self.place + hand[1] - hand[0]
-        return [place] if held and place[2] > LIFTED else []
+        place = self.place + (hand[1] - hand[0])[:3]
+        place[2] *= place[2] > LIFTED
+        in_air = self.place[2] or place[2]
+        return [place] if held and hand[:, 3].min() < OPEN and in_air else []
 
 
 class RigidTracker:
@@ -128,19 +134,20 @@ class RigidTracker:
 
     def _object(self, picture: Picture, cut: Cut, at: np.ndarray, angle: float = 0.0) -> _Object:
         """Return what is known of an object that was cut out around a pixel."""
-        plane, sure = picture.plane, cut.sure(at)
-        # Of half an object, or two witnesses that contradict each other: half way.
-        way = 0.0 if not self._snap else 1.0 if sure else 0.5
+        plane = picture.plane
+        # Where click and middle contradict each other: half way. Of a part the middle says less.
+        way = (0.0 if not self._snap else 1.0 if cut.whole and not cut.touched
+               else PART if not cut.whole and cut.off(at) < CLICKED else 0.5)
         middle = plane.places(centre(top_face(cut.mask, plane)))
         place = way * middle + (1 - way) * plane.places(at, MIDDLE)
         first, face = (Template(picture.by(cut.metric), cut.mask, place, angle, top)
                        for top in (False, True))
-        return _Object(place, [first], face, first, angle, sure=sure, part=not cut.whole)
+        return _Object(place, [first], face, first, angle, sure=cut.sure, part=cut.open)
 
     def update(self, view: View) -> Tracked:
         picture = Picture(view, self._plane, self._first)
         hand = None if view.gripper is None or self._gripper is None else (
-            np.stack([self._gripper, view.gripper])[:, :3])
+            np.stack([self._gripper, view.gripper]) if self._plane.calibrated else None)
         self._gripper = view.gripper
         for one in self._objects:
             self._follow(one, picture, hand)
@@ -179,7 +186,8 @@ class RigidTracker:
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
         picture = picture.by(one.face.metric)
-        if one.searched is not None and self._still(one, one.searched, picture):
+        if one.searched is not None and not one.part and self._still(
+                one, one.searched, picture):
             return
         one.searched, one.waits = None, one.waits - 1
         over = [other.place[2] for other in self._objects if other is not one
@@ -187,13 +195,15 @@ class RigidTracker:
         if over and max(over) > one.place[2] + LIFTED:  # it stays under that
             one.state, one.age, one.confidence = HIDDEN, 0, DOUBT[HIDDEN][0]
             return
-        guesses = [one.place * (1, 1, bool(over))]  # nothing floats
+        stays = bool(over) or hand is None  # else nothing floats
+        guesses, held = [one.place * (1, 1, stays)], False
         if hand is not None:
-            lifted = one.carried(hand) if self._plane.calibrated else []
+            lifted = one.carried(hand)
+            held = bool(one.place[2] and lifted)
             guesses = [*lifted, *guesses] if one.place[2] else [one.pushed(hand), *lifted]
         one.place = guesses[0]
         matcher = Matcher(picture, self._covered(one, picture))
-        pose = self._search(one, matcher, hand, guesses[1:])
+        pose = self._search(one, matcher, hand, guesses[1:], held)
         if pose.fit > GOOD:
             one.place, one.angle, one.template = pose.place, pose.angle, pose.template
             one.age, one.confidence = 0, pose.confidence
@@ -215,24 +225,28 @@ class RigidTracker:
         one.confidence = first * fall ** (one.age - 1)
 
     def _search(self, one: _Object, matcher: Matcher, hand: np.ndarray | None,
-                guesses: Sequence[np.ndarray]) -> Pose:
+                guesses: Sequence[np.ndarray], held: bool) -> Pose:
         """Return the best pose near by, or near guesses where they fit better, else anywhere."""
         grown = 1 + 0.5 * min(one.age, 4)
         reach, turn, keys = REACH * grown, TURN * min(grown, 2), one.nearest()
         others = [(key, one.place) for key in (*keys[1:2], one.face)]
         if hand is not None:
             near = (hand[:, 2] < HAND_HIGH) & (
-                np.linalg.norm((hand - one.place)[:, :2], axis=1) < HAND_FAR)
-            if near.any():
-                others.append((keys[0], one.place + (hand[1] - hand[0]) * (1, 1, 0)))
-            elif one.age == 0:
+                np.linalg.norm(hand[:, :2] - one.place[:2], axis=1) < HAND_FAR)
+            if near.any() and not held:
+                others.append((keys[0], one.place + (hand[1] - hand[0])[:3] * (1, 1, 0)))
+            elif one.age == 0 and not near.any():
                 reach, turn = REST, REST_TURN
-        if guesses or one.place[2]:
+        if guesses:
             reach, turn = CARRIED, CARRIED_TURN
-        best = matcher.refine(keys[0], one.place, one.angle, reach, turn)
+        near_by = (REST, REST_TURN) if held else (reach, turn)  # it moves as the hand does
+        best = matcher.refine(keys[0], one.place, one.angle, *near_by)
+        if held:
+            face = matcher.refine(one.face, one.place, one.angle, *near_by)
+            best = face if face.cost < best.cost - CLEARER else best
         for key, place in product((keys[0], one.face), guesses):
             pose = matcher.refine(key, place, one.angle, reach, turn)
-            if pose.seen > 0.5 and pose.cost < best.cost - CLEARER * bool(one.place[2]):
+            if pose.seen > 0.5 and pose.cost < best.cost - DROPPED * held:
                 best = pose
         if best.fit > GOOD and best.cost < GOOD_COST:
             return best
@@ -274,26 +288,28 @@ class RigidTracker:
         """
         Add a template of the object as it is now: it has turned, and shows other sides.
 
-        That of an object of which a part was seen so far is of all of it, and corrects its place.
+        An object that was seen in part is replaced by what is seen of it now.
         """
         outline = self._outline(one)
         before = cv2.fillPoly(np.zeros(picture.size, np.uint8), [np.rint(outline).astype(int)], 1)
-        if share(before, picture.hidden):
+        if not one.part and share(before, picture.hidden):
             return
         one.waits = WAITS
         at, *others = self._plane.pixels([one.place, *(
             other.place for other in self._objects if other is not one)], MIDDLE)
         radius = 1.4 * float(np.linalg.norm(outline - at, axis=1).max()) + 4
         cut = silhouette(picture, at, others, 0.0 if one.part else radius)
-        if share(cut.mask, picture.hidden):
-            return
-        if not one.part and 0.6 < cut.mask.sum() / one.keys[0].area < 1.6 and (
-                one.keys[0].palette.recurs(
-                    picture.index[cut.mask], one.keys[0].indices) > RECURS):
+        if one.part:
+            if cut.has_more(before > 0, one.part, at) and (
+                    cut.mask & self._covered(one, picture)).sum() < OTHERS * cut.mask.sum():
+                self._objects[self._objects.index(one)] = replace(
+                    self._object(picture, cut, at, one.angle), state=one.state,
+                    confidence=one.confidence, searched=picture, waits=WAITS)
+        elif (not share(cut.mask, picture.hidden)
+              and 0.6 < cut.mask.sum() / one.keys[0].area < 1.6 and one.keys[0].palette.recurs(
+                  picture.index[cut.mask], one.keys[0].indices) > RECURS):
             key = Template(picture, cut.mask, one.place, one.angle)
             one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
-        elif one.part and cut.sure(at) and before[cut.mask].sum() > SHARED * before.sum():
-            self._objects[self._objects.index(one)] = self._object(picture, cut, at, one.angle)
 
     def _tracked(self) -> Tracked:
         """Return where the objects are."""

@@ -16,6 +16,7 @@ RADII = 36, 64  # working pixels from a click to where no object reaches; a larg
 CORE = 3.5  # px around a click that are the object
 COMMON = 0.12  # share of the ring around that a colour of the table has at least
 SHADES = (1.0, 0.5)  # of the table's light, in shadows of objects
+DIM = 0.9  # of the table's light, in shadows of the robot at most
 LIGHTEST = 97  # percentile of the table's lightness: beyond is no table, nor a shadow
 LIKELY, POSSIBLE, SURE = 12.0, 6.0, 25.0  # from the table's colours, of what may be the object
 ALIKE = 14.0  # from the colours under the click, of what is the object where others touch it
@@ -24,10 +25,16 @@ LEAST_AREA = 48  # px; more than CORE, which is taken for the object whatever it
 LEAST_CONTRAST = 7.0  # of the object's colours and the table's, for a click to be believed
 COLOURFUL = 12.0  # contrast of colour without which lightness tells an object, too
 SPREAD = 1.5  # by which it exceeds what colours of the ring differ from the table's, median
-OFF, NEARER, CLEARER = 9.0, 3.0, 1.5  # px from a click to the middle that is doubted, by which
-# another cut is better, and the factor of its contrast
-TOUCHING = 0.15  # share of an outline at the robot, without which it is all of the object
-ENDS = 0.04  # the same at the end of the search, which is to be widened
+OFF = 9.0  # px from a click to the middle, from which on a cut is doubted
+FARTHER = 14.0  # the same, from which on one that is not whole is left for another one
+NEARER, CLEARER = 3.0, 1.5  # px by which another cut is better, and the factor of its contrast
+BAND = 9, 25  # sides of squares that a spot is grown by: between them the table is seen, px
+TOUCHING = 0.08  # share of an outline at the robot, up to which it is all of the object
+# More of an object than a part of it: ends, as a share of those of the part, at most; or its area
+# as a multiple of the part's, from and to; and how much of the part is in it, at least.
+FEWER, MORE, GROWN, KEPT = 0.7, 1.2, 2.0, 0.8
+ENDS = 0.01  # share of an outline at the end of the search, which is to be widened
+FARNESS = 1.0  # what a px from the click of one of two that touch adds to a distance of colours
 SHARED = 0.1  # share of a cut that is in another one, too, without which they do not touch
 _RINGS = (0.75, 1.3)  # of the radius, between which the table is seen
 
@@ -39,16 +46,31 @@ class Cut:
     mask: np.ndarray  # (h, w) bool, all False where nothing differs
     contrast: float  # how its colours differ from those around, median; 0: as those themselves
     metric: Metric  # by which they do
-    whole: bool  # its outline borders neither the robot nor the end of the search
-    touched: bool = False  # only what has colours as under the click: others touch it
+    ends: float  # share of its outline at the robot, its shadow, or the end of the search
+    whole: bool  # hardly any of that is more than a shadow
+    touched: bool = False  # another object touches it, or may be in it
 
     def off(self, at: np.ndarray) -> float:
         """Return the distance of its middle from a pixel, inf where nothing was cut out."""
         return float(np.linalg.norm(centre(self.mask) - at)) if self.mask.any() else np.inf
 
-    def sure(self, at: np.ndarray) -> bool:
-        """Return whether it is all of an object that was clicked at a pixel, and nothing else."""
-        return self.whole and not self.touched and self.off(at) < OFF
+    @property
+    def sure(self) -> bool:
+        """Whether nothing hides a part of it, and no other object seems to be in it."""
+        return not (self.open or self.touched)
+
+    @property
+    def open(self) -> float:
+        """Share of its outline beyond which it may go on unseen, 0 if that is hardly any."""
+        return self.ends if self.ends > TOUCHING else 0.0
+
+    def has_more(self, part: np.ndarray, ends: float, at: np.ndarray) -> bool:
+        """Return whether it is more of an object at a pixel than a part with such ends."""
+        known, area = part.sum(), self.mask.sum()
+        more = self.ends <= max(FEWER * ends, TOUCHING) or area > MORE * known
+        return bool(more and self.contrast >= LEAST_CONTRAST and self.off(at) < OFF
+                    and (self.sure or area < GROWN * known)
+                    and part[self.mask].sum() > KEPT * known)
 
 
 def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.ndarray = (),
@@ -63,24 +85,34 @@ def silhouette(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | 
         return _cut(picture, at, others, min(radius, RADII[1]))
     near, far = RADII
     cut = _cut(picture, at, others, near)
-    if not cut.contrast or share(cut.mask, _beyond(picture, at, near - 2)) > ENDS:
+    ends = share(cut.mask, _beyond(picture, at, near - 2))
+    if cut.contrast < LEAST_CONTRAST or ends > ENDS:
         large = _cut(picture, at, others, far)
-        if large.contrast and not share(large.mask, _beyond(picture, at, far - 2)) > ENDS:
+        if large.contrast >= LEAST_CONTRAST and (
+                share(large.mask, _beyond(picture, at, far - 2)) <= ENDS):
             cut = large
+    if cut.contrast < LEAST_CONTRAST:  # it may be as dark as what is beyond the table
+        spot = _spot(picture, at)
+        if spot.any() and not (spot & _beyond(picture, at, far - 2)).any():
+            inner, outer = (cv2.dilate(spot.astype(np.uint8), np.ones((side, side), np.uint8))
+                            for side in BAND)
+            cut = _cut(picture, at, others, far, ring=outer > inner)
     if cut.off(at) > NEARER:  # another one may touch it
         alone = _cut(picture, at, others, near, alone=True)
-        if (alone.off(at) < cut.off(at) - NEARER and cut.contrast < SURE
-                and alone.contrast > CLEARER * cut.contrast):
-            cut = replace(alone, touched=True)
-    return cut
+        if alone.off(at) < cut.off(at) - NEARER:
+            if (not cut.whole and cut.off(at) > FARTHER and alone.contrast > cut.contrast / 2
+                    or cut.contrast < SURE and alone.contrast > CLEARER * cut.contrast):
+                cut = replace(alone, touched=True)
+    return replace(cut, touched=True) if cut.off(at) > OFF else cut
 
 
 def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.ndarray,
-         radius: float, alone: bool = False) -> Cut:
+         radius: float, alone: bool = False, ring: np.ndarray | None = None) -> Cut:
     """
     Cut out by GrabCut, which begins with colours that are not those of the ring around.
 
     :param alone: only what has colours as under the pixel.
+    :param ring: (h, w) bool, where the table is seen; by default see _RINGS.
     """
     picture, (h, w), (u, v) = picture.by(COLOUR), picture.size, at
     x0, x1 = (int(np.clip(u + side * 1.5 * radius, 0, w)) for side in (-1, 1))
@@ -90,7 +122,8 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     far = np.hypot(x - u, y - v)
     gaps = [np.hypot(x - other[0], y - other[1]) for other in others]  # from those
     hidden = picture.hidden[window]
-    ring = (far > radius * _RINGS[0]) & (far < radius * _RINGS[1])
+    ring = ring[window] if ring is not None else (
+        far > radius * _RINGS[0]) & (far < radius * _RINGS[1])
     for clear in (~hidden, *(gap > radius * 0.6 for gap in gaps)):
         if (ring & clear).sum() > 50:
             ring &= clear
@@ -126,21 +159,40 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     whole = np.zeros(picture.size, bool)
     _, parts = cv2.connectedComponents(cv2.morphologyEx(mask & 1, cv2.MORPH_OPEN, SQUARE))
     if not parts.any():
-        return Cut(whole, 0.0, COLOUR, False)
+        return Cut(whole, 0.0, COLOUR, 1.0, False)
     inside = parts[(far < 2 * CORE) & (parts > 0)]
     part = parts == (np.bincount(inside).argmax() if len(inside) else parts.flat[
         np.where(parts > 0, far, np.inf).argmin()])
     whole[window] = part
+    robot = picture.hidden.copy()  # but for what may be its shadow
+    robot[window] &= (unlike > LIKELY) | (light > DIM * np.median(light[ring]))
     contrast, colour = (float(np.median(one[part])) for one in (unlike, hue))
-    believed = contrast > SPREAD * np.median(unlike[ring])
+    believed = part.sum() >= LEAST_AREA and contrast > SPREAD * np.median(unlike[ring])
+    ends, bare = (share(whole, one | _beyond(picture, at, radius - 2))
+                  for one in (picture.hidden, robot))
     return Cut(whole, contrast if believed else 0.0, COLOUR if colour > COLOURFUL else LIGHT,
-               share(whole, picture.hidden | _beyond(picture, at, radius - 2)) <= TOUCHING)
+               ends, bare <= TOUCHING)
+
+
+def _spot(picture: Picture, at: np.ndarray) -> np.ndarray:
+    """Return what is connected to a pixel and has the colours under it, (h, w) bool."""
+    shown, core = picture.by(LIGHT), (_gap(picture, at) < CORE) & ~picture.hidden
+    if not core.any():
+        return core
+    own = Palette(shown.lab[core], LIGHT).distance(shown.index) < ALIKE
+    _, parts = cv2.connectedComponents((own & ~picture.hidden | core).astype(np.uint8))
+    return np.asarray(parts == parts[core][0])
+
+
+def _gap(picture: Picture, at: np.ndarray) -> np.ndarray:
+    """Return the distance of each pixel (h, w) from one, px."""
+    y, x = np.ogrid[:picture.size[0], :picture.size[1]]
+    return np.asarray(np.hypot(x - at[0], y - at[1]))
 
 
 def _beyond(picture: Picture, at: np.ndarray, radius: float) -> np.ndarray:
     """Return the pixels (h, w) farther from one than a radius, and those at the edge."""
-    y, x = np.ogrid[:picture.size[0], :picture.size[1]]
-    beyond = np.asarray(np.hypot(x - at[0], y - at[1]) > radius)
+    beyond = _gap(picture, at) > radius
     beyond[[0, -1]] = beyond[:, [0, -1]] = True
     return beyond
 
@@ -169,10 +221,11 @@ def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
     if line is not None:
         mask = cv2.fillPoly(np.zeros(picture.size, np.uint8), [
             np.rint(line).clip(-999, 999).astype(int)], 1) > 0
-        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, share(mask, picture.hidden) <= TOUCHING)
+        ends = share(mask, picture.hidden)
+        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, ends, ends <= TOUCHING)
     else:
         cut = silhouette(picture, at, others)
-    if cut.mask.sum() < LEAST_AREA or cut.contrast < LEAST_CONTRAST:
+    if cut.contrast < LEAST_CONTRAST or cut.mask.sum() < LEAST_AREA:
         raise TrackingError(f'{name} is on nothing that differs from the table around it; click '
                             'on an object')
     return cut
@@ -192,10 +245,21 @@ def apart(picture: Picture, clicks: np.ndarray, cuts: Sequence[Cut]) -> list[Cut
             pair, under, under[::-1])]
         if all(mask.any() for mask in own):
             nearer = np.subtract(*(Palette(picture.lab[mask]).distance(picture.index)
-                                   for mask in own)) < 0
-            for k, mask, mine in zip((i, j), pair, (nearer, ~nearer)):
-                found[k] = replace(found[k], mask=mask & (mine | ~shared))
+                                   + FARNESS * _gap(picture, clicks[k])
+                                   for k, mask in zip((i, j), own))) < 0
+            parts = [_connected(mask & (mine | ~shared), _gap(picture, clicks[k]))
+                     for k, mask, mine in zip((i, j), pair, (nearer, ~nearer))]
+            rest = shared & ~(parts[0] | parts[1])  # what is cut off goes to the other one
+            for k, part, mine in zip((i, j), parts, (nearer, ~nearer)):
+                cut = replace(found[k], mask=part | rest & ~mine)
+                found[k] = replace(cut, touched=cut.off(clicks[k]) > OFF)
     return found
+
+
+def _connected(mask: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """Return the connected part of a mask (h, w) with the least gap, all False if it is empty."""
+    _, parts = cv2.connectedComponents(mask.astype(np.uint8))
+    return mask & (parts == parts.flat[np.where(mask, gap, np.inf).argmin()])
 
 
 def top_face(mask: np.ndarray, plane: Plane) -> np.ndarray:
