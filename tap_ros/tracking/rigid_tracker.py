@@ -146,9 +146,10 @@ class RigidTracker:
 
     def update(self, view: View) -> Tracked:
         picture = Picture(view, self._plane, self._first)
-        hand = None if view.gripper is None or self._gripper is None else (
-            np.stack([self._gripper, view.gripper]) if self._plane.calibrated else None)
-        self._gripper = view.gripper
+        before, self._gripper = self._gripper, view.gripper
+        hand = None
+        if self._plane.calibrated and before is not None and view.gripper is not None:
+            hand = np.stack([before, view.gripper])
         for one in self._objects:
             self._follow(one, picture, hand)
         return self._tracked()
@@ -233,10 +234,11 @@ class RigidTracker:
         if hand is not None:
             near = (hand[:, 2] < HAND_HIGH) & (
                 np.linalg.norm(hand[:, :2] - one.place[:2], axis=1) < HAND_FAR)
-            if near.any() and not held:
+            if not near.any():
+                if one.age == 0:
+                    reach, turn = REST, REST_TURN
+            elif not held:  # else it is there already
                 others.append((keys[0], one.place + (hand[1] - hand[0])[:3] * (1, 1, 0)))
-            elif one.age == 0 and not near.any():
-                reach, turn = REST, REST_TURN
         if guesses:
             reach, turn = CARRIED, CARRIED_TURN
         near_by = (REST, REST_TURN) if held else (reach, turn)  # it moves as the hand does

@@ -168,8 +168,8 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     robot[window] &= (unlike > LIKELY) | (light > DIM * np.median(light[ring]))
     contrast, colour = (float(np.median(one[part])) for one in (unlike, hue))
     believed = part.sum() >= LEAST_AREA and contrast > SPREAD * np.median(unlike[ring])
-    ends, bare = (share(whole, one | _beyond(picture, at, radius - 2))
-                  for one in (picture.hidden, robot))
+    beyond = _beyond(picture, at, radius - 2)
+    ends, bare = (share(whole, one | beyond) for one in (picture.hidden, robot))
     return Cut(whole, contrast if believed else 0.0, COLOUR if colour > COLOURFUL else LIGHT,
                ends, bare <= TOUCHING)
 

@@ -52,6 +52,16 @@ def draw(places, angles=(0, 0), size=SIZE, robot=None):
     return View(picture, mask)
 
 
+def demonstrated(task, seed, **options):
+    """Return a simulated Episode of 256 px, and a tracker with its camera."""
+    simulator = Simulator(task, 256, **options)
+    try:
+        return simulator.demonstrate(seed).episode, load_plugin('tap_ros.trackers', 'rigid')(
+            PinholeCamera(simulator.camera_matrix, (256, 256), simulator.camera_pose))
+    finally:
+        simulator.close()
+
+
 @pytest.fixture
 def tracker():
     made = load_plugin('tap_ros.trackers', 'rigid')(None)
@@ -205,13 +215,7 @@ def test_what_is_as_dark_as_the_floor_is_selected():
 
 @pytest.mark.parametrize('appearance', ['usual', 'random'])
 def test_two_of_one_colour_that_touch_are_told_apart_by_where_they_are_clicked(appearance):
-    simulator = Simulator('order2', 256, look='arm', appearance=appearance)
-    try:
-        episode = simulator.demonstrate(1_210_024).episode
-        tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
-            simulator.camera_matrix, (256, 256), simulator.camera_pose))
-    finally:
-        simulator.close()
+    episode, tracker = demonstrated('order2', 1_210_024, look='arm', appearance=appearance)
     places = episode.object_pixels[0]
     found = tracker.select(View(episode.frames[0], episode.robot_masks[0]),
                            places + ((2.2, -1.5), (2.6, 6.4)))
@@ -373,13 +377,7 @@ def test_what_comes_to_a_plank_of_its_own_colour_is_not_unsure():
 @pytest.mark.parametrize('task, seed, look', [
     ('pick_place', 88_006, 'hand'), ('stack2', 88_003, 'hand'), ('pick_place', 1_200_058, 'arm')])
 def test_what_the_hand_carries_is_followed_through_the_air(task, seed, look):
-    simulator = Simulator(task, 256, look=look)
-    try:
-        episode = simulator.demonstrate(seed).episode
-        tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
-            simulator.camera_matrix, (256, 256), simulator.camera_pose))
-    finally:
-        simulator.close()
+    episode, tracker = demonstrated(task, seed, look=look)
     views = [View(*seen) for seen in zip(episode.frames, episode.robot_masks, episode.grippers)]
     tracker.select(views[0], episode.object_pixels[0])
     found = [tracker.update(view) for view in views[1:]]
@@ -389,13 +387,7 @@ def test_what_the_hand_carries_is_followed_through_the_air(task, seed, look):
 
 
 def test_what_lies_under_another_object_is_found_in_a_goal_picture_by_its_sides():
-    simulator = Simulator('stack2', 256)
-    try:
-        episode = simulator.demonstrate(70_005).episode
-        tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
-            simulator.camera_matrix, (256, 256), simulator.camera_pose))
-    finally:
-        simulator.close()
+    episode, tracker = demonstrated('stack2', 70_005)
     tracker.select(View(episode.frames[0], episode.robot_masks[0]), episode.object_pixels[0])
     found = tracker.find(View(episode.goal_frame, episode.goal_mask))
     assert found.states == (SEEN, SEEN)
