@@ -17,7 +17,7 @@ import numpy as np
 from tap_ros.base.contract import HIDDEN, LOST, SEEN, UNSURE
 from tap_ros.base.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.tracking.picture import Picture
+from tap_ros.tracking.picture import CHANGED, Picture
 from tap_ros.tracking.plane import EDGE, MIDDLE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.silhouette import apart, centre, clicked, Cut, share, silhouette, top_face
@@ -64,6 +64,7 @@ class _Object:
     angle: float = 0.0
     state: str = SEEN
     age: int = 0  # pictures since it was seen
+    stirred: bool = False  # since then the hand was near to it
     confidence: float = 1.0
     searched: Picture | None = None  # in which it was found; None: it is not seen
     waits: int = 0  # pictures until it may be cut out anew
@@ -234,10 +235,10 @@ class RigidTracker:
         if hand is not None:
             near = (hand[:, 2] < HAND_HIGH) & (
                 np.linalg.norm(hand[:, :2] - one.place[:2], axis=1) < HAND_FAR)
-            if not near.any():
-                if one.age == 0:
-                    reach, turn = REST, REST_TURN
-            elif not held:  # else it is there already
+            one.stirred = bool(near.any() or one.age and one.stirred)
+            if not one.stirred:
+                reach, turn = REST, REST_TURN
+            elif near.any() and not held:  # else it is there already
                 others.append((keys[0], one.place + (hand[1] - hand[0])[:3] * (1, 1, 0)))
         if guesses:
             reach, turn = CARRIED, CARRIED_TURN
@@ -268,6 +269,12 @@ class RigidTracker:
         """Return what hides an object: the robot, and the others where they are seen."""
         return self._drawn(picture, [other for other in self._objects
                                      if other is not one and other.state == SEEN])
+
+    def _foreign(self, one: _Object, picture: Picture) -> np.ndarray:
+        """Return what is covered, or rather has the colours of another object."""
+        far, *near = (each.face.palette.distance(picture.by(each.face.metric).index)
+                      for each in (one, *self._objects))
+        return self._covered(one, picture) | (far > np.min(near, 0) + CHANGED)
 
     def _drawn(self, picture: Picture, others: Sequence[_Object | Pose]) -> np.ndarray:
         """Return the pixels (h, w) bool of the robot and of others."""
@@ -303,7 +310,7 @@ class RigidTracker:
         cut = silhouette(picture, at, others, 0.0 if one.part else radius)
         if one.part:
             if cut.has_more(before > 0, one.part, at) and (
-                    cut.mask & self._covered(one, picture)).sum() < OTHERS * cut.mask.sum():
+                    cut.mask & self._foreign(one, picture)).sum() < OTHERS * cut.mask.sum():
                 self._objects[self._objects.index(one)] = replace(
                     self._object(picture, cut, at, one.angle), state=one.state,
                     confidence=one.confidence, searched=picture, waits=WAITS)

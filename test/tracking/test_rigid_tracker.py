@@ -174,6 +174,18 @@ def test_a_part_is_corrected_when_the_robot_has_left_also_step_by_step(robots):
     assert np.abs(found.pixels - STARTS).max() < 1 and found.confidence.min() > 0.9
 
 
+@pytest.mark.parametrize('task, seed, clicks', [
+    ('push2', 1_210_027, [(196.0, 91.5), (186.7, 148.7)]), ('order2', 1_210_023, None)])
+def test_a_part_that_the_hand_is_far_above_is_corrected_and_takes_in_no_other(task, seed, clicks):
+    """Also where its side looks like a shadow, or the other one is hidden, too."""
+    episode, tracker = demonstrated(task, seed, look='arm')
+    views = [View(*seen) for seen in zip(episode.frames, episode.robot_masks, episode.grippers)]
+    tracker.select(views[0], episode.object_pixels[0] if clicks is None else clicks)
+    for view in views[1:16]:
+        found = tracker.update(view)
+    assert np.abs(found.pixels - episode.object_pixels[15]).max() < 2
+
+
 def test_a_robot_as_grey_as_the_table_may_hide_a_part():
     grey = np.full((SIZE, SIZE, 3), 170, np.uint8)
     mask = np.zeros((SIZE, SIZE), np.uint8)
