@@ -17,7 +17,7 @@ import numpy as np
 from tap_ros.base.contract import HIDDEN, LOST, SEEN, UNSURE
 from tap_ros.base.errors import TrackingError
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.tracking.picture import CHANGED, Picture
+from tap_ros.tracking.picture import NEAR, Picture
 from tap_ros.tracking.plane import EDGE, MIDDLE, Plane, TOP
 from tap_ros.tracking.protocols import Tracked, View
 from tap_ros.tracking.silhouette import apart, centre, clicked, Cut, share, silhouette, top_face
@@ -271,10 +271,10 @@ class RigidTracker:
                                      if other is not one and other.state == SEEN])
 
     def _foreign(self, one: _Object, picture: Picture) -> np.ndarray:
-        """Return what is covered, or rather has the colours of another object."""
+        """Return what is covered, or has colours of another object and not its own."""
         far, *near = (each.face.palette.distance(picture.by(each.face.metric).index)
                       for each in (one, *self._objects))
-        return self._covered(one, picture) | (far > np.min(near, 0) + CHANGED)
+        return self._covered(one, picture) | (far > NEAR) & (np.min(near, 0) < NEAR)
 
     def _drawn(self, picture: Picture, others: Sequence[_Object | Pose]) -> np.ndarray:
         """Return the pixels (h, w) bool of the robot and of others."""

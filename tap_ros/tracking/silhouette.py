@@ -29,11 +29,11 @@ OFF = 9.0  # px from a click to the middle, from which on a cut is doubted
 FARTHER = 14.0  # the same, from which on one that is not whole is left for another one
 NEARER, CLEARER = 3.0, 1.5  # px by which another cut is better, and the factor of its contrast
 BAND = 9, 25  # sides of squares that a spot is grown by: between them the table is seen, px
-TOUCHING = 0.08  # share of an outline at the robot, up to which it is all of the object
+TOUCHING = 0.1  # share of an outline at the robot, up to which it is all of the object
 # More of an object than a part of it: ends, as a share of those of the part, at most; or its area
 # as a multiple of the part's, from and to; and how much of the part is in it, at least.
 FEWER, MORE, GROWN, KEPT = 0.7, 1.2, 2.0, 0.8
-ENDS = 0.01  # share of an outline at the end of the search, which is to be widened
+ENDS = 0.03  # share of an outline at the end of the search, which is to be widened
 FARNESS = 1.0  # what a px from the click of one of two that touch adds to a distance of colours
 SHARED = 0.1  # share of a cut that is in another one, too, without which they do not touch
 _RINGS = (0.75, 1.3)  # of the radius, between which the table is seen
@@ -57,7 +57,7 @@ class Cut:
     @property
     def sure(self) -> bool:
         """Whether nothing hides a part of it, and no other object seems to be in it."""
-        return not (self.open or self.touched)
+        return self.whole and not (self.open or self.touched)
 
     @property
     def open(self) -> float:
@@ -168,8 +168,8 @@ def _cut(picture: Picture, at: np.ndarray, others: Sequence[np.ndarray] | np.nda
     robot[window] &= (unlike > LIKELY) | (light > DIM * np.median(light[ring]))
     contrast, colour = (float(np.median(one[part])) for one in (unlike, hue))
     believed = part.sum() >= LEAST_AREA and contrast > SPREAD * np.median(unlike[ring])
-    beyond = _beyond(picture, at, radius - 2)
-    ends, bare = (share(whole, one | beyond) for one in (picture.hidden, robot))
+    ends, bare = share(whole, picture.hidden | (_gap(picture, at) > radius - 2)), share(
+        whole, robot | _beyond(picture, at, radius - 2))
     return Cut(whole, contrast if believed else 0.0, COLOUR if colour > COLOURFUL else LIGHT,
                ends, bare <= TOUCHING)
 
@@ -198,10 +198,11 @@ def _beyond(picture: Picture, at: np.ndarray, radius: float) -> np.ndarray:
 
 
 def share(mask: np.ndarray, ends: np.ndarray) -> float:
-    """Return the share of the rim of a mask that is next to other pixels, both (h, w) bool."""
-    shown = mask.astype(np.uint8)
-    rim = cv2.dilate(shown, np.ones((5, 5), np.uint8)) > cv2.erode(shown, SQUARE)
-    return float(ends[rim].mean()) if rim.any() else 0.0
+    """Return the share of what is around a mask that ends are, both (h, w) bool."""
+    shown, ends = np.pad(mask.astype(np.uint8), 2), np.pad(ends, 2, 'edge')
+    # what is next to it shows a bit of it, too
+    around = cv2.dilate(shown, np.ones((5, 5), np.uint8)) > cv2.dilate(shown, SQUARE)
+    return float(ends[around].mean()) if around.any() else 0.0
 
 
 def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
