@@ -205,12 +205,29 @@ def test_of_two_alike_that_touch_one_click_selects_neither_surely():
     assert found.confidence[0] < 0.9
 
 
-def test_what_borders_the_shadow_of_the_robot_is_seen_whole():
-    view, shadow = draw(STARTS), np.s_[80:116, 95:130]
-    view.image[shadow] = 0.6 * view.image[shadow]
-    view.robot_mask[shadow] = 255
+@pytest.mark.parametrize('below, blur', [(116, 0), (130, 0.7)])
+def test_what_borders_the_shadow_of_the_robot_is_seen_whole(below, blur):
+    view = draw(STARTS)
+    for shadow in (np.s_[80:116, 95:130], np.s_[109:below, 60:130]):
+        view.image[shadow] = 0.6 * view.image[shadow]
+        view.robot_mask[shadow] = 255
+    if blur:
+        view.image[:] = cv2.GaussianBlur(view.image, (0, 0), blur)
     found = load_plugin('tap_ros.trackers', 'rigid')(None).select(view, [(77.0, 98.0), STARTS[1]])
     assert np.abs(found.pixels - STARTS).max() < 1
+
+
+def test_what_the_edge_of_the_picture_cuts_is_not_surely_known_and_followed():
+    places = ((6.0, 100.0), STARTS[1])
+    tracker = load_plugin('tap_ros.trackers', 'rigid')(None)
+    found = tracker.select(draw(places), [(9.0, 100.0), STARTS[1]])
+    assert found.confidence[0] < 0.9 <= found.confidence[1]
+    (u, v), off = places[0], found.pixels[0, 0] - places[0][0]
+    for turn in np.linspace(0, 1.2, 7):
+        after = tracker.update(draw(places, (turn, 0)))
+        assert after.states == (SEEN, SEEN)
+        turned = u + off * np.cos(turn), v + off * np.sin(turn)
+        assert np.abs(after.pixels[0] - turned).max() < 2
 
 
 def test_what_is_as_dark_as_the_floor_is_selected():
