@@ -44,7 +44,7 @@ CLICK_LINES = {
     'refused': 'refused', 'selected_within_2px': 'within 2 px',
     'later_within_2px': 'within 2 px at last', 'wrong_sure': 'wrong at last, seen'}
 LINES = {
-    'median_px': 'median error, px', 'within_2px': 'within 2 px',
+    'refused': 'refused', 'median_px': 'median error, px', 'within_2px': 'within 2 px',
     'wrong_sure': 'wrong, said to be seen', 'goal_right': 'found in the goal',
     'goal_wrong': 'found there, wrong'}
 LABELS = 'tracking_labels.json'
