@@ -24,7 +24,7 @@ from tap_ros.tracking.silhouette import apart, centre, clicked, Cut, share, silh
 from tap_ros.tracking.template import APART, Matcher, Pose, SURE, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
-REST, REST_TURN = 0.012, 0.1  # the same, of what the hand is not near to
+REST, REST_TURN = 0.012, 0.1  # the same, of what the hand has not been near to
 CARRIED, CARRIED_TURN = 0.03, 0.5  # of what may be carried
 HAND_FAR, HAND_HIGH = 0.22, 0.1  # m: a hand farther off, or higher, moves nothing
 HAND_HALF = 0.02  # m, half as wide as the fingers are
@@ -64,12 +64,12 @@ class _Object:
     angle: float = 0.0
     state: str = SEEN
     age: int = 0  # pictures since it was seen
-    stirred: bool = False  # since then the hand was near to it
+    stirred: bool = False  # the hand may have moved it since then
     confidence: float = 1.0
     searched: Picture | None = None  # in which it was found; None: it is not seen
     waits: int = 0  # pictures until it may be cut out anew
     sure: bool = True  # its middle is known, not only a click near it
-    part: float = 0.0  # share of its outline beyond which it may go on unseen; 0: it is whole
+    part: float = 0.0  # share of its outline that the robot may hide; 0: none
 
     def nearest(self) -> list[Template]:
         """Return its templates, those first that show it turned like now."""
@@ -203,6 +203,7 @@ class RigidTracker:
             lifted = one.carried(hand)
             held = bool(one.place[2] and lifted)
             guesses = [*lifted, *guesses] if one.place[2] else [one.pushed(hand), *lifted]
+        one.stirred = bool(one.place[2] or one.age and one.stirred)
         one.place = guesses[0]
         matcher = Matcher(picture, self._covered(one, picture))
         pose = self._search(one, matcher, hand, guesses[1:], held)
@@ -232,14 +233,13 @@ class RigidTracker:
         grown = 1 + 0.5 * min(one.age, 4)
         reach, turn, keys = REACH * grown, TURN * min(grown, 2), one.nearest()
         others = [(key, one.place) for key in (*keys[1:2], one.face)]
-        if hand is not None:
-            near = (hand[:, 2] < HAND_HIGH) & (
-                np.linalg.norm(hand[:, :2] - one.place[:2], axis=1) < HAND_FAR)
-            one.stirred = bool(near.any() or one.age and one.stirred)
-            if not one.stirred:
-                reach, turn = REST, REST_TURN
-            elif near.any() and not held:  # else it is there already
-                others.append((keys[0], one.place + (hand[1] - hand[0])[:3] * (1, 1, 0)))
+        near = hand is None or bool(((hand[:, 2] < HAND_HIGH) & (
+            np.linalg.norm(hand[:, :2] - one.place[:2], axis=1) < HAND_FAR)).any())
+        one.stirred |= near
+        if not one.stirred and (one.age == 0 or one.state == HIDDEN):
+            reach, turn = REST, REST_TURN
+        elif hand is not None and near and not held:  # else it is there already
+            others.append((keys[0], one.place + (hand[1] - hand[0])[:3] * (1, 1, 0)))
         if guesses:
             reach, turn = CARRIED, CARRIED_TURN
         near_by = (REST, REST_TURN) if held else (reach, turn)  # it moves as the hand does
@@ -271,9 +271,10 @@ class RigidTracker:
                                      if other is not one and other.state == SEEN])
 
     def _foreign(self, one: _Object, picture: Picture) -> np.ndarray:
-        """Return what is covered, or has colours of another object and not its own."""
+        """Return what is covered, or has the colours of one not seen whole, and not its own."""
+        doubtful = (other for other in self._objects if other.part or other.state != SEEN)
         far, *near = (each.face.palette.distance(picture.by(each.face.metric).index)
-                      for each in (one, *self._objects))
+                      for each in (one, one, *doubtful))
         return self._covered(one, picture) | (far > NEAR) & (np.min(near, 0) < NEAR)
 
     def _drawn(self, picture: Picture, others: Sequence[_Object | Pose]) -> np.ndarray:

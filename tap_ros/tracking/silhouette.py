@@ -47,7 +47,7 @@ class Cut:
     contrast: float  # how its colours differ from those around, median; 0: as those themselves
     metric: Metric  # by which they do
     ends: float  # share of its outline at the robot, its shadow, or the end of the search
-    whole: bool  # hardly any of that is more than a shadow
+    whole: bool  # hardly any of it is at more than a shadow, nor at the picture's edge
     touched: bool = False  # another object touches it, or may be in it
 
     def off(self, at: np.ndarray) -> float:
@@ -56,12 +56,12 @@ class Cut:
 
     @property
     def sure(self) -> bool:
-        """Whether nothing hides a part of it, and no other object seems to be in it."""
+        """Whether nothing hides or cuts a part of it, and no other object seems to be in it."""
         return self.whole and not (self.open or self.touched)
 
     @property
     def open(self) -> float:
-        """Share of its outline beyond which it may go on unseen, 0 if that is hardly any."""
+        """Share of its outline that the robot may hide, 0 if that is hardly any."""
         return self.ends if self.ends > TOUCHING else 0.0
 
     def has_more(self, part: np.ndarray, ends: float, at: np.ndarray) -> bool:
@@ -69,7 +69,7 @@ class Cut:
         known, area = part.sum(), self.mask.sum()
         more = self.ends <= max(FEWER * ends, TOUCHING) or area > MORE * known
         return bool(more and self.contrast >= LEAST_CONTRAST and self.off(at) < OFF
-                    and (self.sure or area < GROWN * known)
+                    and (not (self.open or self.touched) or area < GROWN * known)
                     and part[self.mask].sum() > KEPT * known)
 
 
@@ -198,9 +198,9 @@ def _beyond(picture: Picture, at: np.ndarray, radius: float) -> np.ndarray:
 
 
 def share(mask: np.ndarray, ends: np.ndarray) -> float:
-    """Return the share of what is around a mask that ends are, both (h, w) bool."""
+    """Return which share of the pixels 2 px outside a mask are ends, both (h, w) bool."""
     shown, ends = np.pad(mask.astype(np.uint8), 2), np.pad(ends, 2, 'edge')
-    # what is next to it shows a bit of it, too
+    # the pixels next to it are mixed with it
     around = cv2.dilate(shown, np.ones((5, 5), np.uint8)) > cv2.dilate(shown, SQUARE)
     return float(ends[around].mean()) if around.any() else 0.0
 
@@ -223,7 +223,8 @@ def clicked(picture: Picture, at: np.ndarray, others: np.ndarray, name: str,
         mask = cv2.fillPoly(np.zeros(picture.size, np.uint8), [
             np.rint(line).clip(-999, 999).astype(int)], 1) > 0
         ends = share(mask, picture.hidden)
-        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, ends, ends <= TOUCHING)
+        bare = share(mask, picture.hidden | _beyond(picture, at, np.inf))
+        cut = Cut(mask & ~picture.hidden, np.inf, LIGHT, ends, bare <= TOUCHING)
     else:
         cut = silhouette(picture, at, others)
     if cut.contrast < LEAST_CONTRAST or cut.mask.sum() < LEAST_AREA:

@@ -174,6 +174,15 @@ def test_a_part_is_corrected_when_the_robot_has_left_also_step_by_step(robots):
     assert np.abs(found.pixels - STARTS).max() < 1 and found.confidence.min() > 0.9
 
 
+def test_a_part_is_corrected_also_where_another_object_has_its_colours(monkeypatch):
+    monkeypatch.setitem(globals(), 'COLOURS', (COLOURS[0], (COLOURS[0][1], COLOURS[1][1])))
+    tracker = load_plugin('tap_ros.trackers', 'rigid')(None)
+    tracker.select(draw(STARTS, robot=(80, 70, 130, 130)), [(77.0, 101.0), STARTS[1]])
+    for _ in range(6):
+        found = tracker.update(draw(STARTS))
+    assert np.abs(found.pixels - STARTS).max() < 1 and found.confidence.min() > 0.9
+
+
 @pytest.mark.parametrize('task, seed, clicks', [
     ('push2', 1_210_027, [(196.0, 91.5), (186.7, 148.7)]), ('order2', 1_210_023, None)])
 def test_a_part_that_the_hand_is_far_above_is_corrected_and_takes_in_no_other(task, seed, clicks):
