@@ -231,6 +231,7 @@ def test_what_the_edge_of_the_picture_cuts_is_not_surely_known_and_followed():
     tracker = load_plugin('tap_ros.trackers', 'rigid')(None)
     found = tracker.select(draw(places), [(9.0, 100.0), STARTS[1]])
     assert found.confidence[0] < 0.9 <= found.confidence[1]
+    assert np.abs(found.pixels[0] - places[0]).max() < 4
     (u, v), off = places[0], found.pixels[0, 0] - places[0][0]
     for turn in np.linspace(0, 1.2, 7):
         after = tracker.update(draw(places, (turn, 0)))
